@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A Sequence: images of an object with the camera and the moment of each, as a folder anyone can read.
+
+The layout is the one of NeRF and D-NeRF datasets (`transforms.json`, `images/`, `passes/`), so that
+other programs read it as it is. numpy only: neither bpy nor torch is needed here.
+
+Conventions
+    world       right-handed, Z up; positions are normalised: the object's bounds over the whole clip are
+                centred at the origin and their longest half-side is 1. `Normalisation` leads back.
+    cameras     on disk 4x4 camera-to-world, OpenGL axes (x right, y up, looks along -z);
+                `opengl_to_opencv` is the one place where the axes are turned.
+    time        on disk 0..1 over the clip (D-NeRF's); for the model `model_time`: -1..1, a single frame 0.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+FORMAT = "timesplat-sequence-1"
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used. The message is one sentence that names the file, says what
+    is wrong and what to do; the command line prints it and exits with code 2."""
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """world = scale * normalised + translation (uniform scale > 0, translation in world units)."""
+
+    scale: float = 1.0
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def to_world(self, c2w: np.ndarray) -> np.ndarray:
+        """c2w (…,4,4) in normalised space -> the same camera in world space (rotation unchanged)."""
+        out = np.array(c2w, dtype=np.float64)
+        out[..., :3, 3] = out[..., :3, 3] * self.scale + np.asarray(self.translation)
+        return out
+
+    def from_world(self, c2w: np.ndarray) -> np.ndarray:
+        """Inverse of `to_world`."""
+        out = np.array(c2w, dtype=np.float64)
+        out[..., :3, 3] = (out[..., :3, 3] - np.asarray(self.translation)) / self.scale
+        return out
+
+
+@dataclass
+class View:
+    """One image: a camera at a moment."""
+
+    frame: int  # frame number in the scene
+    camera: str  # camera id: views that share it were taken by one (possibly moving) camera
+    rig: str  # name of the rig it belongs to
+    c2w: np.ndarray  # (4,4) float64, OpenGL axes, normalised space, orthonormal rotation
+    fx: float  # focal lengths and principal point in pixels, pixel centres at +0.5, y down
+    fy: float
+    cx: float
+    cy: float
+    image: str = ""  # path below the Sequence's folder: RGBA, straight alpha, sRGB, 8 bit
+    passes: str | None = None  # EXR with depth and motion vectors, or None
+
+
+@dataclass
+class Sequence:
+    """All views of one clip. `frame_start..frame_end` (inclusive) is the clip; it maps to time 0..1."""
+
+    width: int
+    height: int
+    fps: float
+    frame_start: int
+    frame_end: int
+    normalisation: Normalisation = field(default_factory=Normalisation)
+    aabb: list = field(default_factory=lambda: [[-1, -1, -1], [1, 1, 1]])  # over all frames, normalised
+    provenance: dict = field(default_factory=dict)  # asset, sha256, licence, tool versions, seed, …
+    views: list[View] = field(default_factory=list)
+    root: Path | None = None  # the folder it was read from
+
+    def unit_time(self, frame: float) -> float:
+        """0..1 over the clip; 0 where the clip is one frame."""
+        return (frame - self.frame_start) / max(self.frame_end - self.frame_start, 1)
+
+    def model_time(self, frame: float) -> float:
+        """-1..1 over the clip; 0 where the clip is one frame."""
+        return 2 * self.unit_time(frame) - 1 if self.frame_end > self.frame_start else 0.0
+
+    def times(self, indices=None) -> np.ndarray:
+        """(V,) float32 model times of the views (or of those at `indices`)."""
+        views = self.views if indices is None else [self.views[i] for i in indices]
+        return np.array([self.model_time(v.frame) for v in views], np.float32)
+
+    def cameras(self, indices=None) -> tuple[np.ndarray, np.ndarray]:
+        """c2w (V,4,4) float32 in OpenCV axes, and intrinsics (V,4) float32 fx fy cx cy in pixels."""
+        views = self.views if indices is None else [self.views[i] for i in indices]
+        c2w = opengl_to_opencv(np.stack([v.c2w for v in views]))
+        return c2w.astype(np.float32), np.array([[v.fx, v.fy, v.cx, v.cy] for v in views], np.float32)
+
+    def select(
+        self, *, camera: str | None = None, rig: str | None = None, frame: int | None = None
+    ) -> list[int]:
+        """Indices of the views that match every argument given."""
+        return [
+            i
+            for i, v in enumerate(self.views)
+            if (camera is None or v.camera == camera)
+            and (rig is None or v.rig == rig)
+            and (frame is None or v.frame == frame)
+        ]
+
+    def load_image(self, index: int) -> np.ndarray:
+        """(H,W,4) uint8 RGBA, straight alpha, sRGB-encoded. Raises InputError naming the file."""
+        from PIL import Image
+
+        path = self.root / self.views[index].image
+        try:
+            with Image.open(path) as im:
+                rgba = np.asarray(im.convert("RGBA"))
+        except FileNotFoundError:
+            raise InputError(f"{path}: the image is missing; render the Sequence again.") from None
+        except Exception as e:
+            raise InputError(f"{path}: the image cannot be read ({e}); render the Sequence again.") from None
+        if rgba.shape != (self.height, self.width, 4):
+            raise InputError(
+                f"{path}: the image is {rgba.shape[1]}x{rgba.shape[0]} but transforms.json says "
+                f"{self.width}x{self.height}; render the Sequence again."
+            )
+        return rgba
+
+    def load_passes(self, index: int) -> Passes:
+        """Depth and motion of a view. Raises InputError where the view has none or the file is damaged."""
+        view = self.views[index]
+        if view.passes is None:
+            raise InputError(
+                f"{self.root}: view {view.image} has no depth pass; render with passes, or use a method "
+                "that needs none (rgb)."
+            )
+        return read_passes(self.root / view.passes, (self.height, self.width))
+
+
+@dataclass
+class Passes:
+    """What Blender knows of a view beyond its picture, in pixel rows from the top.
+
+    depth (H,W) float32: planar z of the first surface in normalised units, inf where there is none
+    (pixels whose depth is mixed with the background's are set to inf as well);
+    flow_next, flow_prev (H,W,2) float32: where the surface point seen at the pixel is one frame later /
+    earlier, minus where it is now, in pixels, x right, y DOWN, for a camera that stands still.
+    """
+
+    depth: np.ndarray
+    flow_next: np.ndarray
+    flow_prev: np.ndarray
+
+
+def opengl_to_opencv(c2w: np.ndarray) -> np.ndarray:
+    """c2w (…,4,4): OpenGL camera axes (y up, looks along -z) -> OpenCV (y down, looks along +z), or back."""
+    return c2w * np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def focal_from_fov(fov_degrees: float, size: int) -> float:
+    """Focal length in pixels of a square image of `size` pixels with the given full field of view."""
+    return 0.5 * size / math.tan(math.radians(fov_degrees) / 2)
+
+
+# ---------------------------------------------------------------- depth and motion vectors
+
+
+def read_passes(path: Path, shape: tuple[int, int]) -> Passes:
+    """Reads channels Z, flow_next.x/.y, flow_prev.x/.y of a single-part EXR written by `write_passes`."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as f:
+            channel = {k: np.asarray(c.pixels, np.float32) for k, c in f.channels().items()}
+        depth = channel["Z"]
+        flow = [np.stack([channel[f"{n}.x"], channel[f"{n}.y"]], -1) for n in ("flow_next", "flow_prev")]
+    except KeyError as e:
+        raise InputError(f"{path}: the channel {e} is missing; render the Sequence again.") from None
+    except Exception as e:
+        hint = "is missing" if not Path(path).exists() else f"cannot be read ({e})"
+        raise InputError(f"{path}: the depth pass {hint}; render the Sequence again.") from None
+    if depth.shape != shape:
+        raise InputError(
+            f"{path}: the depth pass is {depth.shape[1]}x{depth.shape[0]} but transforms.json says "
+            f"{shape[1]}x{shape[0]}; render the Sequence again."
+        )
+    if np.isnan(depth).any() or not all(np.isfinite(x).all() for x in flow):
+        raise InputError(f"{path}: the depth pass holds NaN or infinite motion; render the Sequence again.")
+    depth[depth <= 0] = np.inf
+    return Passes(depth, *flow)
+
+
+def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None) -> None:
+    """Single-part ZIP EXR: Z (float), flow_next/flow_prev (half), and R G B A (half, scene-linear
+    premultiplied) where `combined` (H,W,4) is given. Infinite depth is written as 1e10, as Blender does."""
+    import OpenEXR
+
+    half = np.float16
+    channels = {"Z": np.where(np.isfinite(passes.depth), passes.depth, 1e10).astype(np.float32)}
+    for name, flow in (("flow_next", passes.flow_next), ("flow_prev", passes.flow_prev)):
+        for i, axis in enumerate("xy"):
+            channels[f"{name}.{axis}"] = np.ascontiguousarray(flow[..., i], half)
+    if combined is not None:
+        for i, c in enumerate("RGBA"):
+            channels[c] = np.ascontiguousarray(combined[..., i], half)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) -> Sequence:
+    """Writes a Sequence so that it appears whole or not at all.
+
+    `fill(tmp)` puts the images and passes below the temporary folder and sets each view's `image` (and
+    `passes`) to its relative path; then transforms.json is written and the folder moved into place,
+    replacing an older one. Returns the Sequence as read back. On any error nothing stays behind.
+    """
+    folder = Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        fill(tmp)
+        (tmp / "transforms.json").write_text(json.dumps(_to_json(seq), indent=1))
+        os.chmod(tmp, 0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        tmp.rename(folder)
+    except BaseException:
+        shutil.rmtree(tmp, ignore_errors=True)
+        raise
+    return read_sequence(folder)
+
+
+def _to_json(seq: Sequence) -> dict:
+    frames = []
+    for v in seq.views:
+        f = {
+            "file_path": v.image,
+            "transform_matrix": np.asarray(v.c2w, float).tolist(),
+            "fl_x": v.fx,
+            "fl_y": v.fy,
+            "cx": v.cx,
+            "cy": v.cy,
+            "time": seq.unit_time(v.frame),
+            "seconds": (v.frame - seq.frame_start) / seq.fps,
+            "frame": v.frame,
+            "camera": v.camera,
+            "rig": v.rig,
+        }
+        if v.passes:
+            f["exr_path"] = v.passes
+        frames.append(f)
+    return {
+        "format": FORMAT,
+        "camera_model": "OPENCV",
+        "w": seq.width,
+        "h": seq.height,
+        "fps": seq.fps,
+        "frame_start": seq.frame_start,
+        "frame_end": seq.frame_end,
+        "normalisation": asdict(seq.normalisation),
+        "aabb": np.asarray(seq.aabb, float).tolist(),
+        "provenance": seq.provenance,
+        "frames": frames,
+    }
+
+
+def read_sequence(folder: Path) -> Sequence:
+    """Reads and checks `folder/transforms.json`; images are read later, but that they exist is checked now.
+
+    Raises InputError naming the file and the fault: missing or damaged JSON, a missing image, a camera
+    that is not a rigid finite transform, a focal length or size that is not positive.
+    """
+    folder = Path(folder)
+    path = folder / "transforms.json"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a folder that `timesplat render` wrote.")
+    try:
+        d = json.loads(path.read_text())
+        norm = d.get("normalisation", {})
+        seq = Sequence(
+            width=int(d["w"]),
+            height=int(d["h"]),
+            fps=float(d.get("fps", 24.0)),
+            frame_start=int(d.get("frame_start", 0)),
+            frame_end=int(d.get("frame_end", 0)),
+            normalisation=Normalisation(
+                float(norm.get("scale", 1.0)), tuple(float(x) for x in norm.get("translation", (0, 0, 0)))
+            ),
+            aabb=d.get("aabb", [[-1, -1, -1], [1, 1, 1]]),
+            provenance=d.get("provenance", {}),
+            root=folder,
+        )
+        for f in d["frames"]:
+            seq.views.append(
+                View(
+                    frame=int(f["frame"]),
+                    camera=str(f.get("camera", "0")),
+                    rig=str(f.get("rig", "")),
+                    c2w=np.array(f["transform_matrix"], dtype=np.float64),
+                    fx=float(f.get("fl_x", d.get("fl_x"))),
+                    fy=float(f.get("fl_y", d.get("fl_y"))),
+                    cx=float(f.get("cx", d.get("cx", seq.width / 2))),
+                    cy=float(f.get("cy", d.get("cy", seq.height / 2))),
+                    image=str(f["file_path"]),
+                    passes=f.get("exr_path"),
+                )
+            )
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        what = f"the entry {e} is missing" if isinstance(e, KeyError) else f"it is damaged ({e})"
+        raise InputError(f"{path}: {what}; render the Sequence again.") from None
+    _check(seq, path)
+    return seq
+
+
+def _check(seq: Sequence, path: Path) -> None:
+    if seq.width < 1 or seq.height < 1 or seq.fps <= 0 or seq.frame_end < seq.frame_start or not seq.views:
+        raise InputError(f"{path}: size, fps, frame range or views are empty or negative; render it again.")
+    s = seq.normalisation
+    if not (s.scale > 0 and np.isfinite([s.scale, *s.translation]).all()):
+        raise InputError(f"{path}: the normalisation is not a finite positive scale; render it again.")
+    root = path.parent.resolve()
+    for v in seq.views:
+        name = v.image or "?"
+        R = v.c2w[:3, :3] if v.c2w.shape == (4, 4) else None
+        if R is None or not np.isfinite(v.c2w).all():
+            raise InputError(f"{path}: the camera of {name} is not a finite 4x4 matrix; correct it.")
+        if np.abs(R.T @ R - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+            raise InputError(f"{path}: the camera of {name} is singular or not a rotation; correct it.")
+        if not (v.fx > 0 and v.fy > 0 and np.isfinite([v.fx, v.fy, v.cx, v.cy]).all()):
+            raise InputError(f"{path}: the focal length of {name} is not positive; correct it.")
+        for rel in filter(None, (v.image, v.passes)):
+            full = (path.parent / rel).resolve()
+            if not full.is_relative_to(root):
+                raise InputError(f"{path}: {rel} points outside of the Sequence's folder; correct it.")
+            if not full.is_file():
+                raise InputError(f"{full}: the file is missing; render the Sequence again.")

@@ -1,0 +1,1 @@
+"""First floor: views become Gaussians4D become views. torch; never bpy."""
