@@ -29,13 +29,15 @@ class Gaussians4D:
     rotation: Tensor  # (…,N,4) unit quaternion w x y z of Σ_3's axes
     rgb: Tensor  # (…,N,3) sRGB-encoded colour, 0..1 (not enforced)
     opacity: Tensor  # (…,N) 0..1
+    cov3: Tensor | None = None  # (…,N,3,3) Σ_3 where gradients must reach it (the paper's head), else None
 
     def __len__(self) -> int:
         return self.xyz.shape[-2]
 
     def map(self, f) -> Gaussians4D:
         """A new cloud with f applied to every field."""
-        return Gaussians4D(*(f(getattr(self, k.name)) for k in fields(self)))
+        values = (getattr(self, k.name) for k in fields(self))
+        return Gaussians4D(*(None if v is None else f(v) for v in values))
 
     def __getitem__(self, index) -> Gaussians4D:
         """Index or mask along the first dimension of every field."""
@@ -54,6 +56,8 @@ class Gaussians4D:
 
     def covariance3(self) -> Tensor:
         """(…,N,3,3) Σ_3, the covariance of the slice at any time."""
+        if self.cov3 is not None:
+            return self.cov3
         M = rotation_matrix(self.rotation) * self.scale[..., None, :]
         return M @ M.mT
 
@@ -72,17 +76,29 @@ class Gaussians4D:
 
     def to_asset(self, clip: Clip) -> Asset:
         """numpy twin for files and Blender; no batch dimensions."""
-        arrays = {k.name: getattr(self, k.name).detach().cpu().float().numpy() for k in fields(self)}
+        arrays = {k: getattr(self, k).detach().cpu().float().numpy() for k in FIELDS}
         return Asset(**{k: np.ascontiguousarray(a) for k, a in arrays.items()}, clip=clip)
 
     @staticmethod
     def from_asset(asset: Asset) -> Gaussians4D:
-        return Gaussians4D(*(torch.from_numpy(getattr(asset, k.name).copy()) for k in fields(Gaussians4D)))
+        return Gaussians4D(*(torch.from_numpy(getattr(asset, k).copy()) for k in FIELDS))
+
+    @staticmethod
+    def from_covariance(xyz, t, velocity, sigma_t, cov3, rgb, opacity) -> Gaussians4D:
+        """From Σ_3 (…,N,3,3) instead of scale and rotation, which are derived without gradient."""
+        with torch.no_grad():
+            scale, rotation = scale_rotation_from_covariance(cov3)
+        return Gaussians4D(xyz, t, velocity, sigma_t, scale, rotation, rgb, opacity, cov3)
 
     @staticmethod
     def cat(parts: list[Gaussians4D]) -> Gaussians4D:
         """Joins clouds along N (no batch dimensions)."""
-        return Gaussians4D(*(torch.cat([getattr(p, k.name) for p in parts]) for k in fields(Gaussians4D)))
+        joined = [torch.cat([getattr(p, k) for p in parts]) for k in FIELDS]
+        with_cov3 = any(p.cov3 is not None for p in parts)
+        return Gaussians4D(*joined, torch.cat([p.covariance3() for p in parts]) if with_cov3 else None)
+
+
+FIELDS = [k.name for k in fields(Gaussians4D) if k.name != "cov3"]  # what an Asset holds as well
 
 
 def rotation_matrix(q: Tensor) -> Tensor:
@@ -148,11 +164,11 @@ def scale_rotation_from_covariance(cov3: Tensor) -> tuple[Tensor, Tensor]:
 def paper_from_kinematic(g: Gaussians4D) -> tuple[Tensor, Tensor, Tensor]:
     """-> scale (…,N,4) and the two unit quaternions q_l, q_r (…,N,4) with Σ = R S Sᵀ Rᵀ, for 4DGS tools.
 
-    The eigenvectors of Σ give R in SO(4); M = Lᵀ-free factoring: the "associate matrix" of R has rank one
-    and is q_l q_rᵀ (van Elfrinkhof), from which both quaternions are read up to a common sign."""
+    The eigenvectors of Σ give R in SO(4); its "associate matrix" has rank one and is q_l q_rᵀ (van
+    Elfrinkhof), from which both quaternions are read up to a common sign."""
     val, R = torch.linalg.eigh(g.covariance4())
     flip = torch.sign(torch.linalg.det(R))[..., None, None]
-    R = torch.cat([R[..., :3] * 1.0, R[..., 3:] * flip], -1)
+    R = torch.cat([R[..., :3], R[..., 3:] * flip], -1)
     # Solve R = L(q_l) R(q_r) = Σ_ij q_l[i] q_r[j] B_ij with the 16 orthogonal basis matrices B_ij (norm 2).
     eye = torch.eye(4, dtype=R.dtype, device=R.device)
     basis = isoclinic_rotation(eye[:, None].expand(4, 4, 4), eye[None].expand(4, 4, 4))  # (4,4,4,4)

@@ -1,0 +1,33 @@
+# Everything sets itself up: a virtual environment in .venv with pinned versions (constraints.txt).
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+.DEFAULT_GOAL := help
+
+help:            ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing: install Python 3.11 (apt install python3.11 python3.11-venv), or set PYTHON=…"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+setup: $(VENV)/.ready ## the environment alone
+
+demo: $(VENV)/.ready ## render, reconstruct and export a procedural animated object into out/demo
+	$(BIN)/timesplat demo --out out/demo
+
+test: $(VENV)/.ready ## all tests, lint included
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest
+
+zip: $(VENV)/.ready ## the Blender extension, into dist/
+	$(BIN)/timesplat extension --out dist
+
+clean:           ## what can be made again
+	rm -rf $(VENV) out dist build *.egg-info
+
+.PHONY: help setup demo test zip clean

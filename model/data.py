@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training data: rendered Sequences, packed once for quick random access, and samples drawn from them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from tqdm import tqdm
+
+from ..datagen.sequence import InputError, read_sequence
+from .views import Views
+
+# How the input views of a sample are chosen, and how often. Every one gives a view for each frame, as the
+# paper's evaluation setups do; `every` takes any camera at each frame.
+SAMPLERS = {"alternating": 0.4, "interpolation": 0.1, "moving": 0.15, "every": 0.35}
+
+
+@dataclass
+class Sample:
+    """Input views with depth and flow, and the target views; `name` says which clip they are of."""
+
+    inputs: Views
+    targets: Views
+    name: str
+
+
+def pack(folder: Path, cache: Path) -> Path:
+    """Sequence folder -> one .safetensors below `cache`, made anew when the Sequence changed. Depth and
+    flow are kept for foreground pixels alone, in half precision."""
+    folder = Path(folder)
+    stamp = (folder / "transforms.json").stat().st_mtime_ns if (folder / "transforms.json").is_file() else 0
+    key = hashlib.sha256(f"{folder.resolve()} {stamp}".encode()).hexdigest()[:16]
+    path = Path(cache) / f"{key}.safetensors"
+    if path.exists():
+        return path
+    seq = read_sequence(folder)
+    rgba, values, offsets = [], [], [0]
+    for i in range(len(seq.views)):
+        passes = seq.load_passes(i)
+        image = seq.load_image(i)
+        known = np.isfinite(passes.depth) & (image[..., 3] > 0)
+        depth = np.where(known, passes.depth, 0)[..., None]
+        stack = np.concatenate([depth, passes.flow_next, passes.flow_prev], -1)
+        rgba.append(image)
+        values.append(stack[known].astype(np.float16))
+        offsets.append(offsets[-1] + int(known.sum()))
+        rgba[-1] = np.concatenate([image, known[..., None].astype(np.uint8)], -1)
+    c2w, intrinsics = seq.cameras()
+    cameras = [v.camera for v in seq.views]
+    names = sorted(set(cameras))
+    tensors = {
+        "rgba": torch.from_numpy(np.stack(rgba)),  # the fifth channel says where depth is known
+        "values": torch.from_numpy(np.concatenate(values)),
+        "offsets": torch.tensor(offsets),
+        "c2w": torch.from_numpy(c2w),
+        "intrinsics": torch.from_numpy(intrinsics),
+        "time": torch.from_numpy(seq.times()),
+        "frame": torch.tensor([v.frame - seq.frame_start for v in seq.views]),
+        "camera": torch.tensor([names.index(c) for c in cameras]),
+    }
+    meta = {
+        "cameras": json.dumps(names),
+        "frames": str(seq.frame_end - seq.frame_start + 1),
+        "name": folder.name,
+    }
+    meta["asset"] = str(seq.provenance.get("asset", folder.parent.name))
+    Path(cache).mkdir(parents=True, exist_ok=True)
+    tmp = path.with_suffix(".tmp")
+    save_file(tensors, tmp, meta)
+    tmp.replace(path)
+    return path
+
+
+class Clips:
+    """Packed clips and random samples of them."""
+
+    def __init__(self, folders: list[Path], cache: Path):
+        """folders: Sequence folders, or folders that hold them at any depth. Raises InputError if none."""
+        found = [p.parent for f in folders for p in sorted(Path(f).rglob("transforms.json"))]
+        if not found:
+            raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
+        self.paths = [pack(f, cache) for f in tqdm(found, desc="packing", unit="clip", leave=False)]
+
+    def sample(self, rng: np.random.Generator, targets: int, views: int = 24) -> Sample:
+        """A clip at random, `views` input views by one of SAMPLERS, and `targets` other views of any time,
+        those from moving cameras three times as likely as those from the canonical four."""
+        path = self.paths[rng.integers(len(self.paths))]
+        with safe_open(path, "pt") as f:
+            meta = f.metadata()
+            frame, camera = f.get_tensor("frame").numpy(), f.get_tensor("camera").numpy()
+            names = json.loads(meta["cameras"])
+            chosen = choose_inputs(rng, frame, camera, names, views)
+            canonical = np.isin(camera, [names.index(c) for c in CANONICAL if c in names])
+            weight = np.where(canonical, 1.0, 3.0)
+            weight[chosen] = 0
+            picked = rng.choice(len(frame), targets, replace=False, p=weight / weight.sum())
+            step = 2 / max(int(meta["frames"]) - 1, 1)
+            return Sample(_views(f, chosen, step), _views(f, picked, step), meta["asset"])
+
+
+CANONICAL = ("front", "left", "back", "right")
+
+
+def choose_inputs(rng, frame, camera, names: list[str], views: int) -> np.ndarray:
+    """Indices of the input views of a sample: at most `views`, in the order of time."""
+    kinds = list(SAMPLERS)
+    kind = kinds[rng.choice(len(kinds), p=list(SAMPLERS.values()))]
+    fixed = [names.index(c) for c in CANONICAL if c in names]
+    moving = [i for i in range(len(names)) if i not in fixed]
+    pool = {"moving": moving, "every": list(range(len(names)))}.get(kind, fixed) or list(range(len(names)))
+    start = rng.integers(len(pool))
+    out = []
+    for n, t in enumerate(np.unique(frame)):
+        if kind == "interpolation":
+            if n % 2 == 0:
+                out += [(t, pool[(start + n + k) % len(pool)]) for k in (0, 1)]
+        elif kind == "every":
+            out.append((t, pool[rng.integers(len(pool))]))
+        else:
+            out.append((t, pool[(start + n) % len(pool)]))
+    index = {(f, c): i for i, (f, c) in enumerate(zip(frame.tolist(), camera.tolist(), strict=True))}
+    found = np.array([index[k] for k in ((int(t), int(c)) for t, c in out) if k in index])
+    if len(found) > views:
+        found = found[np.sort(rng.choice(len(found), views, replace=False))]
+    return found
+
+
+def _views(f, indices: np.ndarray, step: float) -> Views:
+    # get_slice takes no index lists: whole tensors are memory-mapped, and only these rows are touched.
+    rows = torch.from_numpy(np.asarray(indices))
+    packed = f.get_tensor("rgba")[rows]
+    offsets, values = f.get_tensor("offsets"), f.get_tensor("values")
+    known = packed[..., 4] > 0
+    depth = torch.full(known.shape, torch.inf)
+    flow = torch.zeros(*known.shape, 4)
+    for n, i in enumerate(rows.tolist()):
+        v = values[offsets[i] : offsets[i + 1]].float()
+        depth[n][known[n]], flow[n][known[n]] = v[:, 0], v[:, 1:]
+    rgba = packed[..., :4].float() / 255
+    tensors = [f.get_tensor(k)[rows] for k in ("c2w", "intrinsics", "time")]
+    return Views(rgba[..., :3], rgba[..., 3], *tensors, step, depth, flow)

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""4D-LRM: posed, timed images to 4D Gaussians in one transformer pass (paper, section 2.2, appendix A).
+
+Pixels carry colour, time and their ray (10 channels); 8x8 patches become tokens; a plain pre-LN transformer
+without position embeddings mixes the tokens of all views; one linear layer decodes every token into a
+Gaussian per pixel. As in GS-LRM's lineage: no biases, N(0, 0.02), no QK norm.
+
+Beyond the paper, and off where its letter is wanted:
+    tokens only where the object is: patches without foreground never enter (`drop_empty`);
+    heads: `paper` (20 outputs a pixel) or `kinematic` (19);
+    sources of the distance along a ray: `predicted` (the paper's), or `sweep` and `given`, where a Geometry
+    is known per pixel: its features are extra channels and the outputs are bounded residuals to its
+    Gaussians, so that an untrained network returns them unchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from .gaussians import Gaussians4D, isoclinic_rotation, kinematic_from_covariance
+from .lift import FEATURES, Geometry
+from .views import Views, pluecker, rays
+
+
+@dataclass(frozen=True)
+class Config:
+    width: int = 256
+    depth: int = 4
+    heads: int = 4
+    patch: int = 8
+    head: str = "kinematic"  # paper | kinematic
+    source: str = "predicted"  # predicted | sweep | given
+    depth_range: str = "paper"  # paper: 0.1..4.5 | centred: 1.8 to either side of the ray's middle
+    free: int = 0  # free Gaussian tokens
+
+    @property
+    def channels(self) -> int:
+        return 10 + (FEATURES if self.source != "predicted" else 0)
+
+    @property
+    def outputs(self) -> int:
+        return 20 if self.head == "paper" else 19
+
+
+PRESETS = {
+    "large": Config(width=1024, depth=24, heads=16, head="paper"),
+    "base": Config(width=768, depth=12, heads=12, head="paper"),
+    "small": Config(width=384, depth=6, heads=6),
+    "tiny": Config(width=256, depth=4, heads=4),
+}
+
+
+class Block(nn.Module):
+    """Pre-LN self-attention and MLP, each with a residual connection."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.norm1 = nn.LayerNorm(width, bias=False)
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+        self.proj = nn.Linear(width, width, bias=False)
+        self.norm2 = nn.LayerNorm(width, bias=False)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, 4 * width, bias=False), nn.GELU(), nn.Linear(4 * width, width, bias=False)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:  # (T, D)
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, self.heads, -1)).permute(1, 2, 0, 3)  # (3, nh, T, hs)
+        y = F.scaled_dot_product_attention(*qkv[:, None])[0]  # (nh, T, hs)
+        x = x + self.proj(y.transpose(0, 1).flatten(1))
+        return x + self.mlp(self.norm2(x))
+
+
+class Network(nn.Module):
+    """forward(views, geometry) -> Gaussians4D of one scene."""
+
+    def __init__(self, config: Config):
+        super().__init__()
+        self.config = c = config
+        self.embed = nn.Linear(c.patch**2 * c.channels, c.width, bias=False)
+        self.norm_in = nn.LayerNorm(c.width, bias=False)
+        self.blocks = nn.ModuleList(Block(c.width, c.heads) for _ in range(c.depth))
+        self.norm_out = nn.LayerNorm(c.width, bias=False)
+        self.decode = nn.Linear(c.width, c.patch**2 * c.outputs, bias=False)
+        if c.free:
+            self.free_tokens = nn.Parameter(torch.randn(c.free, c.width) * 0.02)
+            self.decode_free = nn.Linear(c.width, c.outputs, bias=False)
+        self.recompute = False  # gradient checkpointing, set by training
+        for m in self.modules():
+            if isinstance(m, nn.Linear):
+                nn.init.normal_(m.weight, std=0.02)
+        if c.source != "predicted":
+            nn.init.zeros_(self.decode.weight)  # starts as the Geometry itself
+
+    def forward(self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True) -> Gaussians4D:
+        """views: V images, height and width multiples of the patch; geometry: for the sources `sweep` and
+        `given`. Pixels in dropped patches, and pixels without valid geometry, yield no Gaussian."""
+        c, p = self.config, self.config.patch
+        height, width = views.size
+        if height % p or width % p:
+            raise ValueError(f"images are {width}x{height}: width and height must be multiples of {p}")
+        origin, direction = rays(views.c2w, views.intrinsics, height, width)
+        time = views.time[:, None, None, None].expand(*views.alpha.shape, 1)
+        maps = [2 * views.over(1.0) - 1, time, pluecker(origin, direction)]
+        if geometry is not None:
+            maps.append(geometry.features)
+        keep = self.kept_patches(views, drop_empty)
+        x = patchify(torch.cat(maps, -1), p)[keep]  # (T, p², channels)
+        x = self.norm_in(self.embed(x.flatten(1)))  # (T, D)
+        tokens = len(x)
+        if c.free:
+            x = torch.cat([x, self.free_tokens])
+        for block in self.blocks:
+            x = checkpoint(block, x, use_reentrant=False) if self.recompute else block(x)
+        x = self.norm_out(x)
+        g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.outputs))  # (T, p², outputs)
+
+        def pixels(m: Tensor) -> Tensor:
+            return gather_pixels(m, keep, p)
+
+        if geometry is not None:
+            base = geometry.gaussians.map(pixels)
+            out = self.residual(g, base, pixels(direction), pixels(geometry.slack))
+            out = out[pixels(geometry.valid)]
+        else:
+            out = self.pixel_aligned(g, pixels(origin), pixels(direction)).map(lambda m: m.flatten(0, 1))
+        if c.free:
+            free = self.activate(self.decode_free(x[tokens:]).float())
+            out = Gaussians4D.cat([out, free])
+        return out
+
+    def kept_patches(self, views: Views, drop_empty: bool = True) -> Tensor:
+        """(P,) bool: the patches that become tokens; with `drop_empty` those that show any foreground."""
+        seen = patchify(views.alpha[..., None], self.config.patch).amax((1, 2)) > 0
+        return seen if drop_empty else torch.ones_like(seen)
+
+    def pixel_aligned(self, g: Tensor, origin: Tensor, direction: Tensor) -> Gaussians4D:
+        """g (…,outputs), origin and direction (…,3) -> Gaussians on their pixels' rays (appendix A.1)."""
+        omega = torch.sigmoid(g[..., :3].mean(-1, keepdim=True))
+        if self.config.depth_range == "paper":
+            delta = 0.1 * (1 - omega) + 4.5 * omega
+        else:
+            delta = (2 * omega - 1) * 1.8 - (origin * direction).sum(-1, keepdim=True)
+        out = self.activate(g)
+        out.xyz = origin + delta * direction
+        if self.training:  # a centre outside of the box can only be wrong
+            out.xyz = out.xyz.clamp(-1, 1)
+        return out
+
+    def activate(self, g: Tensor) -> Gaussians4D:
+        """g (…,outputs) in the order xyz t rgb scale_xyz scale_t, then q_l q_r opacity (paper) or q velocity
+        opacity (kinematic) -> Gaussians with the appendix's activations and biases."""
+        xyz, t, rgb, s, s_t = g[..., :3], g[..., 3], g[..., 4:7], g[..., 7:10], g[..., 10]
+        rgb = 0.5 + 0.28209479177387814 * rgb  # zero-order SH
+        scale = torch.exp(s - 2.3).clamp_max(0.3)
+        scale_t = torch.exp(s_t - 2.3).clamp_max(1.0)
+        opacity = torch.sigmoid(g[..., -1] - 2.0)
+        if self.config.head == "kinematic":
+            return Gaussians4D(
+                xyz,
+                t,
+                g[..., 15:18],
+                scale_t,
+                scale,
+                F.normalize(g[..., 11:15] + _IDENTITY.to(g), dim=-1),
+                rgb,
+                opacity,
+            )
+        R = isoclinic_rotation(F.normalize(g[..., 11:15], dim=-1), F.normalize(g[..., 15:19], dim=-1))
+        M = R * torch.cat([scale, scale_t[..., None]], -1)[..., None, :]
+        velocity, sigma_t, cov3 = kinematic_from_covariance(M @ M.mT)
+        return Gaussians4D.from_covariance(xyz, t, velocity, sigma_t, cov3, rgb, opacity)
+
+    def residual(self, g: Tensor, base: Gaussians4D, direction: Tensor, slack: Tensor) -> Gaussians4D:
+        """g (…,19), base Gaussians (…), their rays' directions (…,3), slack (…) -> base plus bounded steps:
+        along the ray by `slack`, σ and σ_t by a factor of e^1.5, colour by 0.5, velocity by 4 per unit of
+        time, μ_t by 0.3, opacity by 4 in its logit."""
+        move = slack[..., None] * torch.tanh(g[..., :3].mean(-1, keepdim=True))
+        turn = torch.cat([torch.ones_like(g[..., :1]), 0.5 * g[..., 12:15]], -1)  # g[11] has no effect
+        return Gaussians4D(
+            xyz=base.xyz + move * direction,
+            t=base.t + 0.3 * torch.tanh(g[..., 3]),
+            velocity=base.velocity + 4 * torch.tanh(0.25 * g[..., 15:18]),
+            sigma_t=base.sigma_t * torch.exp(1.5 * torch.tanh(g[..., 10])),
+            scale=base.scale * torch.exp(1.5 * torch.tanh(g[..., 7:10])),
+            rotation=multiply(base.rotation, F.normalize(turn, dim=-1)),
+            rgb=base.rgb + 0.5 * torch.tanh(g[..., 4:7]),
+            opacity=torch.sigmoid(torch.logit(base.opacity, 1e-4) + 4 * torch.tanh(0.5 * g[..., -1])),
+        )
+
+
+_IDENTITY = torch.tensor([1.0, 0, 0, 0])
+
+
+def multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Product of quaternions (…,4), w x y z: first b, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def gather_pixels(m: Tensor, keep: Tensor, p: int) -> Tensor:
+    """m (V,H,W,…), keep (P,) bool with T patches kept -> (T, p², …), the order of the network's Gaussians."""
+    patches = patchify(m.reshape(*m.shape[:3], -1), p)[keep]
+    return patches.reshape(*patches.shape[:2], *m.shape[3:])
+
+
+def patchify(x: Tensor, p: int) -> Tensor:
+    """(V,H,W,C) -> (V·H/p·W/p, p², C), patches row by row, pixels row by row within."""
+    V, H, W, C = x.shape
+    x = x.reshape(V, H // p, p, W // p, p, C).permute(0, 1, 3, 2, 4, 5)
+    return x.reshape(-1, p * p, C)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From a Sequence to Gaussians4D by a named method, and the checkpoints that methods load."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from ..datagen.sequence import InputError, Sequence
+from .asset import Clip
+from .gaussians import Gaussians4D
+from .views import Views, load_views
+
+CHECKPOINTS = Path(__file__).parent / "checkpoints"
+# What each method needs: depth and motion vectors, or pictures with alpha alone.
+METHODS = {
+    "white": "the empty picture",
+    "hull": "visual hull in the object's mean colour (RGB and alpha)",
+    "lift": "depth and motion vectors to Gaussians, no network",
+    "guided": "the network over depth and motion vectors",
+    "rgb": "the network over RGB alone: the better of `sweep` and `predicted` on held-out objects",
+    "sweep": "the network over RGB with depths swept from the other views",
+    "predicted": "the paper's network over RGB, token dropping on",
+}
+NEEDS_PASSES = {"lift", "guided"}
+RGB = "sweep"  # what `rgb` stands for
+
+
+def clip_of(seq: Sequence) -> Clip:
+    """The Clip that leads an asset of this Sequence back to its scene."""
+    n = seq.normalisation
+    return Clip(seq.fps, seq.frame_start, seq.frame_end, n.scale, tuple(n.translation))
+
+
+def reconstruct(
+    sequence: Sequence,
+    method: str = "guided",
+    indices=None,
+    device: str = "cpu",
+    checkpoint: Path | None = None,
+    progress=None,
+) -> Gaussians4D:
+    """Views `indices` of the Sequence (all of them by default) -> Gaussians4D, those filtered out that the
+    paper's inference filters would never draw. `progress(fraction, text)` is called between steps.
+
+    Raises InputError for an unknown method, missing passes, a damaged image or checkpoint."""
+    report = progress or (lambda fraction, text: None)
+    if method not in METHODS:
+        raise InputError(f"{method}: no such method; choose one of {', '.join(METHODS)}.")
+    report(0.0, "reading views")
+    indices = range(len(sequence.views)) if indices is None else indices
+    views = load_views(sequence, indices, passes=method in NEEDS_PASSES)
+    if not (views.alpha > 0.5).any():
+        raise InputError(f"{sequence.root}: no view shows the object; check the cameras and the alpha channel.")
+    report(0.3, f"reconstructing ({method})")
+    with torch.inference_mode():
+        g = reconstruct_views(views, method, device, checkpoint)
+    return g[g.alive()]
+
+
+def reconstruct_views(views: Views, method: str, device: str = "cpu", checkpoint: Path | None = None) -> Gaussians4D:
+    """The same from tensors; unfiltered."""
+    if method in ("white", "hull"):
+        from . import baselines
+
+        return getattr(baselines, method)(views)
+    if method == "lift":
+        from .lift import lift
+
+        return lift(views)
+    method = RGB if method == "rgb" else method
+    network = load_network(checkpoint or CHECKPOINTS / f"{method}.safetensors", device)
+    geometry = geometry_for(network.config.source, views)
+    if geometry is not None:
+        geometry = type(geometry)(*(x.to(device) for x in vars(geometry).values()))
+    return network(views.to(device), geometry).to("cpu")
+
+
+def geometry_for(source: str, views: Views):
+    """The Geometry that a network with this depth source starts from (None for `predicted`)."""
+    if source == "given":
+        from .lift import lift_geometry
+
+        return lift_geometry(views)
+    if source == "sweep":
+        from .sweep import sweep_geometry
+
+        return sweep_geometry(views)
+    return None
+
+
+def save_network(path: Path, network, extra: dict[str, str] | None = None) -> None:
+    """Weights in half precision with the config (and `extra` strings) inside, written whole or not at all."""
+    from safetensors.torch import save_file
+
+    path = Path(path)
+    tensors = {k: v.detach().half().contiguous() for k, v in network.state_dict().items()}
+    tmp = path.with_name(path.name + ".tmp")
+    save_file(tensors, tmp, {"config": json.dumps(asdict(network.config)), **(extra or {})})
+    tmp.replace(path)
+
+
+def load_network(path: Path, device: str = "cpu"):
+    """A network in evaluation mode from a .safetensors with its config inside. Raises InputError."""
+    from safetensors import safe_open
+
+    from .network import Config, Network
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such checkpoint; train one with `timesplat train`, or name another.")
+    try:
+        with safe_open(path, "pt") as f:
+            config = Config(**json.loads(f.metadata()["config"]))
+            tensors = {k: f.get_tensor(k).float() for k in f.keys()}  # noqa: SIM118
+        with torch.device("meta"):
+            network = Network(config)
+        network.load_state_dict(tensors, assign=True)
+    except Exception as e:
+        raise InputError(f"{path}: not a whole Timesplat checkpoint ({e}); copy or train it again.") from None
+    bad = [k for k, v in tensors.items() if not torch.isfinite(v).all()]
+    if bad:
+        raise InputError(f"{path}: the weights {bad[0]} hold NaN or infinity; copy or train it again.")
+    return network.to(device).eval()

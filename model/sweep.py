@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Depth from several photographs: along each ray, what the other views' silhouettes and colours allow.
+
+Candidate distances along a pixel's ray are scored by how many other views see them inside the silhouette
+and in a like colour, weighted by closeness in time (objects move). Marching from the camera, the first
+candidates that hold take the ray: their mean is the depth, their spread its uncertainty. That is a soft
+visual hull with colour agreement; it needs posed images with alpha, and nothing that Blender alone knows.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import torch
+
+from .gaussians import Gaussians4D, quaternion
+from .lift import FEATURES, OPACITY, Geometry, tangent_frame
+from .views import Views, camera_rays
+
+CANDIDATES = 64  # distances along a ray, over its way through the unit box
+MEMORY = 1.5  # frames after which another view's word counts 1/e
+COLOUR = 0.25  # RMS colour difference at which agreement has fallen to exp(-½)
+DENSITY = 0.5  # how much of the remaining ray an undisputed candidate takes
+
+
+def sweep_depth(views: Views) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Views with alpha -> planar z (V,H,W), its standard deviation (V,H,W), and certainty (V,H,W) 0..1; zero
+    where alpha is below one half. Deterministic."""
+    mask = views.alpha > 0.35
+    args = [views.rgb, views.alpha, views.time / views.frame_step, views.c2w, torch.linalg.inv(views.c2w)]
+    arrays = [np.ascontiguousarray(x.numpy(), np.float32) for x in (*args, views.intrinsics)]
+    return tuple(torch.from_numpy(x) for x in _sweep(*arrays, mask.numpy()))
+
+
+def sweep_geometry(views: Views) -> Geometry:
+    """Views with alpha -> Geometry per pixel: depth by `sweep_depth`, surfaces facing the camera, no motion,
+    a lifetime from how soon another view looks from about the same side."""
+    depth, spread, certainty = sweep_depth(views)
+    valid = depth > 0
+    step = views.frame_step
+    R = views.c2w[:, :3, :3]
+    ray = camera_rays(views.intrinsics, *views.size)
+    pixel = depth / views.intrinsics[:, 0, None, None]
+    point = ray * depth[..., None]
+    facing = torch.zeros_like(point)
+    facing[..., 0] = pixel
+    scale, axes = tangent_frame(facing, facing.roll(1, -1), point, pixel)
+    world = torch.einsum("vij,vhwj->vhwi", R, point) + views.c2w[:, None, None, :3, 3]
+    span = relief(views)[:, None, None].expand_as(depth)
+    gaussians = Gaussians4D(
+        xyz=world,
+        t=views.time[:, None, None].expand_as(depth),
+        velocity=torch.zeros_like(world),
+        sigma_t=1.3 * span * step,
+        scale=scale,
+        rotation=quaternion((R[:, None, None] @ axes).expand(*depth.shape, 3, 3)),
+        rgb=views.rgb,
+        opacity=(OPACITY * views.alpha).clamp(1e-3, 0.99),
+    )
+    distance = depth * ray.norm(dim=-1)
+    maps = [distance / 2.7 - 1, spread, certainty, views.alpha, 0.25 * span]
+    features = torch.stack(maps + [torch.zeros_like(depth)] * (FEATURES - len(maps)), -1)
+    return Geometry(gaussians, valid, 0.1 + 2 * spread, torch.where(valid[..., None], features, 0.0))
+
+
+def relief(views: Views) -> torch.Tensor:
+    """(V,) half the frames until another view looks from within 50 degrees of a view's direction: about how
+    long what it sees must live. Between half a frame and six frames."""
+    frame = views.time / views.frame_step
+    forward = views.c2w[:, :3, 2]
+    same = forward @ forward.T > math.cos(math.radians(50))
+    gap = (frame[:, None] - frame[None]).abs()
+    gap = torch.where(same & (gap > 0.5), gap, math.inf).amin(-1)
+    return (0.5 * gap).clamp(0.5, 6.0)
+
+
+@numba.njit(cache=True, parallel=True, fastmath=True)
+def _sweep(rgb, alpha, frame, c2w, w2c, K, mask):
+    V, H, W = alpha.shape
+    depth = np.zeros((V, H, W), np.float32)
+    spread = np.zeros((V, H, W), np.float32)
+    certainty = np.zeros((V, H, W), np.float32)
+    for row in numba.prange(V * H):
+        i, v = row // H, row % H
+        direction = np.empty(3, np.float32)
+        weight = np.empty(CANDIDATES, np.float32)
+        for u in range(W):
+            if not mask[i, v, u]:
+                continue
+            x, y = (u + 0.5 - K[i, 2]) / K[i, 0], (v + 0.5 - K[i, 3]) / K[i, 1]
+            near, far = np.float32(0.05), np.float32(1e9)  # planar z where the ray is inside [-1,1]^3
+            for k in range(3):
+                direction[k] = c2w[i, k, 0] * x + c2w[i, k, 1] * y + c2w[i, k, 2]
+                if abs(direction[k]) > 1e-6:
+                    a, b = (-1 - c2w[i, k, 3]) / direction[k], (1 - c2w[i, k, 3]) / direction[k]
+                    near, far = max(near, min(a, b)), min(far, max(a, b))
+            if far <= near:
+                continue
+            step = (far - near) / CANDIDATES
+            left, total, mean, square, best = 1.0, 0.0, 0.0, 0.0, 0.0
+            for n in range(CANDIDATES):
+                z = near + (n + 0.5) * step
+                px = c2w[i, 0, 3] + z * direction[0]
+                py = c2w[i, 1, 3] + z * direction[1]
+                pz = c2w[i, 2, 3] + z * direction[2]
+                inside, agree, votes = 0.0, 0.0, 0.0
+                for j in range(V):
+                    dt = abs(frame[j] - frame[i])
+                    if j == i or dt > 4 * MEMORY:
+                        continue
+                    zj = w2c[j, 2, 0] * px + w2c[j, 2, 1] * py + w2c[j, 2, 2] * pz + w2c[j, 2, 3]
+                    if zj < 0.01:
+                        continue
+                    xj = w2c[j, 0, 0] * px + w2c[j, 0, 1] * py + w2c[j, 0, 2] * pz + w2c[j, 0, 3]
+                    yj = w2c[j, 1, 0] * px + w2c[j, 1, 1] * py + w2c[j, 1, 2] * pz + w2c[j, 1, 3]
+                    uj = int(np.floor(xj / zj * K[j, 0] + K[j, 2]))
+                    vj = int(np.floor(yj / zj * K[j, 1] + K[j, 3]))
+                    if uj < 0 or vj < 0 or uj >= W or vj >= H:
+                        continue
+                    w = np.exp(-dt / MEMORY)
+                    inside += w * np.log(max(alpha[j, vj, uj], np.float32(0.02)))
+                    difference = 0.0
+                    for k in range(3):
+                        difference += (rgb[j, vj, uj, k] - rgb[i, v, u, k]) ** 2
+                    agree += w * np.exp(-difference / (6 * COLOUR * COLOUR))
+                    votes += w
+                hold = np.exp(inside)
+                if votes > 0:
+                    hold *= 0.4 + 0.6 * agree / votes
+                weight[n] = left * DENSITY * hold
+                left *= 1 - DENSITY * hold
+                total += weight[n]
+                mean += weight[n] * z
+                square += weight[n] * z * z
+                best = max(best, hold)
+            if total < 1e-4:  # no candidate holds: silhouettes contradict each other (fast motion)
+                depth[i, v, u] = 0.5 * (near + far)
+                spread[i, v, u] = 0.3 * (far - near)
+                continue
+            mean /= total
+            depth[i, v, u] = mean
+            spread[i, v, u] = np.sqrt(max(square / total - mean * mean, 0.0))
+            certainty[i, v, u] = best
+    return depth, spread, certainty

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Views: posed, timed images as tensors, and the rays through their pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datagen.sequence import Sequence
+
+
+@dataclass
+class Views:
+    """V images of one clip. Colours are sRGB-encoded, 0..1; cameras OpenCV camera-to-world, normalised."""
+
+    rgb: Tensor  # (V,H,W,3) straight colour (not multiplied by alpha)
+    alpha: Tensor  # (V,H,W) 0..1
+    c2w: Tensor  # (V,4,4)
+    intrinsics: Tensor  # (V,4) fx fy cx cy in pixels, pixel centres at +0.5
+    time: Tensor  # (V,) -1..1 over the clip
+    frame_step: float  # model time between two frames of the clip, 2 / (frames - 1)
+    depth: Tensor | None = None  # (V,H,W) planar z, inf where there is no surface
+    flow: Tensor | None = None  # (V,H,W,4) pixels to the next frame (x, y) and to the previous one (x, y)
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def __getitem__(self, index) -> Views:
+        pick = {k.name: getattr(self, k.name) for k in fields(self)}
+        return Views(**{k: x[index] if isinstance(x, Tensor) else x for k, x in pick.items()})
+
+    def to(self, device) -> Views:
+        pick = {k.name: getattr(self, k.name) for k in fields(self)}
+        return Views(**{k: x.to(device) if isinstance(x, Tensor) else x for k, x in pick.items()})
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height, width."""
+        return self.rgb.shape[1], self.rgb.shape[2]
+
+    def over(self, background: float | Tensor = 1.0) -> Tensor:
+        """(V,H,W,3) the pictures composited over a background (scalar or (3,)), white by default."""
+        a = self.alpha[..., None]
+        return self.rgb * a + background * (1 - a)
+
+
+def load_views(seq: Sequence, indices, passes: bool = False) -> Views:
+    """The views of a Sequence at `indices`. Raises InputError for a missing or damaged image or pass."""
+    rgba = torch.from_numpy(np.stack([seq.load_image(i) for i in indices])).float() / 255
+    c2w, intrinsics = seq.cameras(indices)
+    views = Views(
+        rgb=rgba[..., :3],
+        alpha=rgba[..., 3],
+        c2w=torch.from_numpy(c2w),
+        intrinsics=torch.from_numpy(intrinsics),
+        time=torch.from_numpy(seq.times(indices)),
+        frame_step=2 / max(seq.frame_end - seq.frame_start, 1),
+    )
+    if passes:
+        p = [seq.load_passes(i) for i in indices]
+        views.depth = torch.from_numpy(np.stack([x.depth for x in p]))
+        views.flow = torch.from_numpy(np.stack([np.concatenate([x.flow_next, x.flow_prev], -1) for x in p]))
+    return views
+
+
+def camera_rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """intrinsics (V,4) -> (V,H,W,3) camera-space points at planar z = 1 below each pixel's centre."""
+    fx, fy, cx, cy = intrinsics[:, :, None, None].unbind(1)
+    y, x = torch.meshgrid(
+        torch.arange(height, device=fx.device) + 0.5,
+        torch.arange(width, device=fx.device) + 0.5,
+        indexing="ij",
+    )
+    return torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(fx) * torch.ones_like(x)], -1)
+
+
+def rays(c2w: Tensor, intrinsics: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """c2w (V,4,4), intrinsics (V,4) -> ray origins (V,H,W,3) and unit directions (V,H,W,3), world space."""
+    direction = torch.einsum("vij,vhwj->vhwi", c2w[:, :3, :3], camera_rays(intrinsics, height, width))
+    direction = torch.nn.functional.normalize(direction, dim=-1)
+    return c2w[:, None, None, :3, 3].expand_as(direction), direction
+
+
+def pluecker(origin: Tensor, direction: Tensor) -> Tensor:
+    """(…,3), (…,3) unit -> (…,6): direction, and the ray's point closest to the origin (paper, 2.2)."""
+    nearest = origin - (origin * direction).sum(-1, keepdim=True) * direction
+    return torch.cat([direction, nearest], -1)
