@@ -13,3 +13,62 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+
+
+@pytest.fixture(scope="session")
+def spheres():
+    """A scene known by hand, ray-traced in float64: three striped spheres that move on straight lines.
+    `spheres(frames, cameras=…, size=…)` -> Views with exact depth, flow and alpha (no anti-aliasing), one view
+    a frame; `spheres.truth(points, frame)` -> velocity per frame of the sphere that each point lies on."""
+    import numpy as np
+    import torch
+
+    from timesplat.datagen.rigs import spherical
+    from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
+    from timesplat.model.views import Views, camera_rays
+
+    centre = np.array([[-0.35, 0.0, 0.1], [0.4, -0.2, -0.3], [0.2, 0.35, 0.4]])
+    motion = np.array([[0.02, 0.01, 0.0], [-0.01, 0.0, 0.02], [0.0, -0.025, 0.0]])  # per frame
+    radius = np.array([0.38, 0.3, 0.25])
+    colour = np.array([[0.9, 0.3, 0.2], [0.2, 0.6, 0.9], [0.9, 0.8, 0.2]])
+
+    def make(frames, cameras=None, size=48, count=24):
+        """frames: list of frame numbers 0..count-1; cameras: (azimuth, elevation) of each in degrees."""
+        cameras = cameras or [(90 * (f % 4), 0) for f in frames]
+        c2w = np.stack([opengl_to_opencv(spherical(*c)) for c in cameras])
+        f = focal_from_fov(50, size)
+        K = np.tile([f, f, size / 2, size / 2], (len(frames), 1))
+        local = camera_rays(torch.tensor(K), size, size).numpy().astype(np.float64)
+        shape = (len(frames), size, size)
+        depth, rgb, flow = np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros((*shape, 4))
+        for v, frame in enumerate(frames):
+            o, R = c2w[v, :3, 3], c2w[v, :3, :3]
+            d = local[v] @ R.T
+            for c, m, r, paint in zip(centre, motion, radius, colour, strict=True):
+                at = c + m * (frame - (count - 1) / 2)
+                a, b = (d * d).sum(-1), (d * (o - at)).sum(-1)
+                disc = b * b - a * ((o - at) @ (o - at) - r * r)
+                z = np.where(disc > 0, (-b - np.sqrt(np.maximum(disc, 0))) / a, np.inf)
+                hit = (z > 0) & (z < depth[v])
+                p = o + np.where(hit, z, 0)[..., None] * d
+                stripe = 0.75 + 0.25 * np.sin(9 * (p - at)[..., 2] / r)
+                for k, sign in enumerate((1, -1)):
+                    q = (p + sign * m - o) @ R
+                    pixel = q[..., :2] / np.where(hit, q[..., 2], 1)[..., None] * f + size / 2
+                    here = (local[v][..., :2]) * f + size / 2
+                    flow[v][hit, 2 * k : 2 * k + 2] = (pixel - here)[hit]
+                depth[v][hit], rgb[v][hit] = z[hit], (paint * stripe[..., None])[hit]
+        tensors = [torch.tensor(x, dtype=torch.float32) for x in (rgb, np.isfinite(depth), c2w, K)]
+        time = torch.tensor([2 * x / (count - 1) - 1 for x in frames], dtype=torch.float32)
+        views = Views(*tensors, time, 2 / (count - 1))
+        views.depth, views.flow = (torch.tensor(x, dtype=torch.float32) for x in (depth, flow))
+        return views
+
+    def truth(points, frame, count=24):
+        """points (N,3) on the surfaces at a frame (scalar or (N,)) -> (N,3) velocity per frame."""
+        at = centre + motion * (np.asarray(frame).reshape(-1, 1, 1) - (count - 1) / 2)
+        off = np.abs(np.linalg.norm(points[:, None] - at, axis=-1) - radius)
+        return motion[off.argmin(1)]
+
+    make.truth = truth
+    return make
