@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The differentiable rasteriser of 4D Gaussians: one function, a CPU and a CUDA backend, a slow reference.
+
+What is computed is written down in `reference.py`. All backends follow gsplat's conventions ("classic" mode,
+EWA projection with clamped slopes, +0.3 px² on the diagonal, near plane 0.01, alpha in [1/255, 0.999], stop at
+transmittance 1e-4), so that a model trained with one renders the same with another.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..gaussians import Gaussians4D
+
+BACKENDS = ("cpu", "cuda", "reference")
+
+
+def rasterize(
+    xyz: Tensor,
+    t: Tensor,
+    velocity: Tensor,
+    sigma_t: Tensor,
+    covariance: Tensor,
+    rgb: Tensor,
+    opacity: Tensor,
+    c2w: Tensor,
+    intrinsics: Tensor,
+    time: Tensor,
+    width: int,
+    height: int,
+    *,
+    background: float | Tensor = 1.0,
+    inference: bool = False,
+    backend: str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Images of N 4D Gaussians in kinematic form from C cameras, each at its own time (paper, section 2.1).
+
+    At a camera's time τ a Gaussian is the 3D one with mean xyz + velocity (τ - t), covariance Σ_3 and opacity
+    o exp(-½ ((τ - t) / σ_t)²); slicing, projection and blending all happen here.
+
+    xyz (N,3), t (N) in [-1,1], velocity (N,3) per unit of t, sigma_t (N) > 0, covariance (N,3,3) = Σ_3
+    (its symmetric part counts), rgb (N,3) any values, opacity (N) in 0..1: floating tensors on one device,
+    differentiable. Cameras, without gradients: c2w (C,4,4) OpenCV axes, a rigid transform; intrinsics (C,4)
+    fx fy cx cy in pixels, pixel centres at +0.5; time (C) in [-1,1].
+    background: one value or (3,). inference: skip, per view, Gaussians whose marginal or weighted opacity is
+    below 0.05 (appendix A.2); not for training, where it would cut gradients. backend: "cpu" (float32 inside),
+    "cuda" (gsplat) or "reference" (slow; computes in the inputs' precision); None goes by the device.
+
+    -> rgb (C,height,width,3) over the background, alpha (C,height,width), in the dtype of xyz.
+    ValueError for a wrong shape, NaN or infinity, naming the tensor."""
+    gaussians = {
+        "xyz": (xyz, (3,)), "t": (t, ()), "velocity": (velocity, (3,)), "sigma_t": (sigma_t, ()),
+        "covariance": (covariance, (3, 3)), "rgb": (rgb, (3,)), "opacity": (opacity, ()),
+    }  # fmt: skip
+    cameras = {"c2w": (c2w, (4, 4)), "intrinsics": (intrinsics, (4,)), "time": (time, ())}
+    for group in (gaussians, cameras):
+        first = next(iter(group.values()))[0]
+        rows = first.shape[0] if first.ndim else 0
+        for name, (x, shape) in group.items():
+            if tuple(x.shape) != (rows, *shape):
+                raise ValueError(f"rasterize: {name} has shape {tuple(x.shape)}, expected {(rows, *shape)}")
+            if not x.is_floating_point():
+                raise ValueError(f"rasterize: {name} has dtype {x.dtype}, expected floating point")
+            # One pass; the sum of finite numbers may overflow, so only a suspect is looked at closely.
+            if not x.detach().sum().isfinite() and not x.detach().isfinite().all():
+                bad = int((~x.detach().isfinite()).sum())
+                raise ValueError(f"rasterize: {name} has {bad} values that are NaN or infinite")
+    if width < 1 or height < 1:
+        raise ValueError(f"rasterize: image size {width} x {height}")
+    background = torch.as_tensor(background, dtype=xyz.dtype, device=xyz.device).detach()
+    if background.numel() not in (1, 3) or background.ndim > 1 or not background.isfinite().all():
+        raise ValueError("rasterize: background must be one finite number or three")
+    background = background.expand(3)
+
+    backend = backend or ("cuda" if xyz.is_cuda else "cpu")
+    if backend == "cpu":
+        from .cpu import rasterize as run
+    elif backend == "cuda":
+        from .cuda import rasterize as run
+    elif backend == "reference":
+        from .reference import rasterize as run
+    else:
+        raise ValueError(f"rasterize: backend {backend!r}, expected one of {BACKENDS}")
+    inputs = [x for x, _ in (*gaussians.values(), *cameras.values())]
+    return run(*inputs, (int(width), int(height)), background, bool(inference))
+
+
+def render(
+    g: Gaussians4D, c2w: Tensor, intrinsics: Tensor, time: Tensor, width: int, height: int, **kw
+) -> tuple[Tensor, Tensor]:
+    """`rasterize` of a cloud without batch dimensions; same cameras, keywords, results and errors."""
+    return rasterize(
+        g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity,
+        c2w, intrinsics, time, width, height, **kw
+    )  # fmt: skip
