@@ -1,1 +1,3 @@
 """Ground floor: a Blender scene becomes a Sequence. bpy, numpy, OpenEXR; never torch."""
+
+ASSET_SUFFIXES = (".blend", ".glb", ".gltf", ".fbx", ".obj", ".usd", ".usda", ".usdc", ".usdz")  # what it opens

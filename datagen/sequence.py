@@ -25,6 +25,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .pixels import write_exr
+
 FORMAT = "timesplat-sequence-1"
 
 
@@ -103,9 +105,7 @@ class Sequence:
         c2w = opengl_to_opencv(np.stack([v.c2w for v in views]))
         return c2w.astype(np.float32), np.array([[v.fx, v.fy, v.cx, v.cy] for v in views], np.float32)
 
-    def select(
-        self, *, camera: str | None = None, rig: str | None = None, frame: int | None = None
-    ) -> list[int]:
+    def select(self, *, camera: str | None = None, rig: str | None = None, frame: int | None = None) -> list[int]:
         """Indices of the views that match every argument given."""
         return [
             i
@@ -201,8 +201,6 @@ def read_passes(path: Path, shape: tuple[int, int]) -> Passes:
 def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None) -> None:
     """Single-part ZIP EXR: Z (float), flow_next/flow_prev (half), and R G B A (half, scene-linear
     premultiplied) where `combined` (H,W,4) is given. Infinite depth is written as 1e10, as Blender does."""
-    import OpenEXR
-
     half = np.float16
     channels = {"Z": np.where(np.isfinite(passes.depth), passes.depth, 1e10).astype(np.float32)}
     for name, flow in (("flow_next", passes.flow_next), ("flow_prev", passes.flow_prev)):
@@ -211,8 +209,7 @@ def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None)
     if combined is not None:
         for i, c in enumerate("RGBA"):
             channels[c] = np.ascontiguousarray(combined[..., i], half)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, channels).write(str(path))
+    write_exr(path, channels)
 
 
 # ---------------------------------------------------------------- the folder

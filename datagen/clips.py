@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The clips of an opened asset: which actions play together, on what, from when to when.
+
+Importers leave animations in three ways: as NLA tracks, one per object and all named alike for one clip
+(glTF); as actions of which only the last is assigned (FBX, and .blend files made for games); or as what the
+scene simply shows (.blend, USD). All end as a `Clip`. To play one, all NLA tracks are muted and the actions
+assigned: un-muting a track after an evaluation with all muted gives frozen frames.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import bpy
+
+# modifiers that can move something without any action
+_MOVING = {"MESH_SEQUENCE_CACHE", "NODES", "CLOTH", "SOFT_BODY", "FLUID", "OCEAN", "WAVE", "BUILD", "PARTICLE_SYSTEM"}
+
+
+@dataclass
+class Clip:
+    """One animation, scene frames `frame_start..frame_end` inclusive."""
+
+    name: str
+    frame_start: int
+    frame_end: int
+    actions: list = field(default_factory=list)  # (ID that moves, Action, slot or None); [] = the scene as it is
+
+    def frames(self, count: int = 24) -> list[int]:
+        """The first `count` scene frames; a shorter clip repeats its last. A clip of one frame has one."""
+        if self.frame_end <= self.frame_start:
+            return [self.frame_start]
+        return [min(self.frame_start + i, self.frame_end) for i in range(count)]
+
+
+def find_clips(imported: bool) -> list[Clip]:
+    """All clips of the open file. `imported`: an importer made the scene, so each group of actions is a clip;
+    else the scene as it is comes first, then the actions that it does not use. Never empty: what does not
+    move is one clip of one frame, named "static"."""
+    clips = [] if imported else _scene_clip()
+    if imported:
+        clips += _track_clips()
+    in_use = {id_.animation_data.action for id_ in animated_ids() if id_.animation_data.action}
+    in_tracks = {s.action for id_ in animated_ids() for t in id_.animation_data.nla_tracks for s in t.strips}
+    free = [a for a in bpy.data.actions if a not in in_tracks and (imported or a not in in_use)]
+    clips += _action_clips(free)
+    frame = bpy.context.scene.frame_current
+    return clips or [Clip("static", frame, frame)]
+
+
+def animated_ids() -> list:
+    """Every data-block of the file that carries animation data (objects, shape keys, materials, …)."""
+    found = []
+    for name in ("objects", "shape_keys", "meshes", "armatures", "materials", "curves", "lattices"):
+        found += [x for x in getattr(bpy.data, name, ()) if x.animation_data]
+    trees = [x.node_tree for x in bpy.data.materials if x.node_tree]
+    return found + [x for x in (*trees, *bpy.data.node_groups) if x.animation_data]
+
+
+def _scene_clip() -> list[Clip]:
+    scene = bpy.context.scene
+    moves = any(
+        d.animation_data.action or d.animation_data.drivers or any(not t.mute for t in d.animation_data.nla_tracks)
+        for d in animated_ids()
+    ) or any(
+        ob.rigid_body
+        or any(m.type in _MOVING for m in ob.modifiers)
+        or any(c.type == "TRANSFORM_CACHE" for c in ob.constraints)
+        for ob in scene.objects
+    )
+    return [Clip("scene", scene.frame_start, scene.frame_end)] if moves else []
+
+
+def _track_clips() -> list[Clip]:
+    groups: dict[str, list] = {}
+    for owner in animated_ids():
+        for track in owner.animation_data.nla_tracks:
+            for strip in track.strips:
+                if strip.action:
+                    slot = getattr(strip, "action_slot", None)
+                    groups.setdefault(track.name, []).append((owner, strip.action, slot))
+    return [_clip(name, actions) for name, actions in groups.items()]
+
+
+def _action_clips(actions: list) -> list[Clip]:
+    """Actions outside of any NLA track, put on what they fit; `Object|Take` names of different objects that
+    share the take are one clip, as are the slots of one action."""
+    groups: dict[str, list] = {}
+    for action in actions:
+        name = action.name.partition("|")[2] or action.name
+        fits = _owners(action)
+        taken = {owner for owner, _, _ in groups.get(name, [])}
+        if taken & {owner for owner, _, _ in fits}:
+            name = action.name
+        if fits:
+            groups.setdefault(name, []).extend(fits)
+    return [_clip(name, fits) for name, fits in groups.items()]
+
+
+def _owners(action) -> list:
+    """(ID, action, slot) for each slot of the action, on the ID that it names or else fits best."""
+    if not hasattr(action, "slots"):  # before Blender 4.4 an action had one user
+        owner = _best_owner(action.id_root, "", action.fcurves)
+        return [(owner, action, None)] if owner else []
+    found = []
+    for slot in action.slots:
+        curves = [
+            c
+            for layer in action.layers
+            for strip in layer.strips
+            for bag in [strip.channelbag(slot)]
+            if bag
+            for c in bag.fcurves
+        ]
+        owner = _best_owner(slot.target_id_type, slot.name_display, curves)
+        if owner:
+            found.append((owner, action, slot))
+    return found
+
+
+def _best_owner(kind: str, name: str, curves):
+    pools = {"OBJECT": bpy.data.objects, "KEY": bpy.data.shape_keys, "MATERIAL": bpy.data.materials}
+    pools["ARMATURE"], pools["MESH"] = bpy.data.armatures, bpy.data.meshes
+
+    def fit(id_) -> float:
+        good = 0
+        for c in curves:
+            try:
+                id_.path_resolve(c.data_path)
+                good += 1
+            except ValueError:
+                pass
+        # every object has a location: of those that resolve all curves the one of that name wins, then
+        # one that is animated anyhow
+        return good + 0.5 * (id_.name == name) + 0.25 * bool(id_.animation_data)
+
+    best = max(pools.get(kind, ()), key=fit, default=None)
+    return best if best is not None and curves and fit(best) >= 1 else None
+
+
+def _clip(name: str, actions: list) -> Clip:
+    ranges = [action.curve_frame_range for _, action, _ in actions]
+    start = math.floor(min(r[0] for r in ranges) + 1e-4)
+    return Clip(name, start, max(start, math.ceil(max(r[1] for r in ranges) - 1e-4)), actions)
+
+
+# ---------------------------------------------------------------- playing
+
+
+def rest_pose() -> dict:
+    """The pose of everything that a clip may move: what the next clip does not animate goes back to it."""
+    rest = {}
+    for ob in bpy.data.objects:
+        rest[ob] = ob.matrix_basis.copy()
+        for bone in ob.pose.bones if ob.pose else ():
+            rest[bone] = bone.matrix_basis.copy()
+    for keys in bpy.data.shape_keys:
+        for block in keys.key_blocks:
+            rest[block] = block.value
+    return rest
+
+
+def play(clip: Clip, rest: dict) -> None:
+    """Makes the open scene show `clip`; see the module's text. The scene as it is needs nothing."""
+    if not clip.actions:
+        return
+    for id_ in animated_ids():
+        for track in id_.animation_data.nla_tracks:
+            track.mute, track.is_solo = True, False
+        id_.animation_data.action = None
+    for item, value in rest.items():
+        if isinstance(value, float):
+            item.value = value
+        else:
+            item.matrix_basis = value
+    for id_, action, slot in clip.actions:
+        data = id_.animation_data or id_.animation_data_create()
+        data.action = action
+        if slot is not None:
+            data.action_slot = slot

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Opens an asset in Blender safely, finds its clips, measures it; and lends a scene out unharmed.
+
+An opened asset is never moved or re-parented: `normalisation` says where it lies, and the cameras go there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from . import ASSET_SUFFIXES
+from .clips import Clip, find_clips, play, rest_pose
+from .sequence import InputError, Normalisation
+
+LARGEST = 1e6  # coordinates beyond this are damage, not size: single precision gives out
+
+
+@dataclass
+class Asset:
+    """What `open_asset` found in the scene that is now open."""
+
+    path: Path
+    sha256: str
+    clips: list[Clip]
+    warnings: list[str] = field(default_factory=list)
+    rest: dict = field(default_factory=dict)
+
+    def play(self, clip: Clip) -> None:
+        """Makes the scene show this clip, from the pose that the file was opened with."""
+        play(clip, self.rest)
+
+
+def empty() -> None:
+    """An empty Blender session with factory settings."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def versions() -> dict:
+    """What made the pictures, for provenance."""
+    from .. import __version__
+
+    return {"blender": bpy.app.version_string, "timesplat": __version__}
+
+
+def open_asset(path: Path) -> Asset:
+    """Opens a file of one of ASSET_SUFFIXES in an emptied session; scripts in it never run. Its own lights and
+    cameras are deleted, bone-shape objects that an importer made are hidden.
+
+    Raises InputError: file missing, of an unknown kind or damaged; no mesh; vertices that are NaN, infinite
+    or beyond 1e6; a texture path that leads out of the file's folder. A texture that is merely missing is
+    replaced by a light grey one (Blender would render magenta) and named in `Asset.warnings`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path.")
+    suffix = path.suffix.lower()
+    if suffix not in ASSET_SUFFIXES:
+        raise InputError(f"{path}: files of this kind cannot be opened; give one of {', '.join(ASSET_SUFFIXES)}.")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if suffix in (".glb", ".gltf"):
+        _check_gltf(path)
+    empty()
+    try:
+        _load(path, suffix)
+    except RuntimeError as e:
+        reason = str(e).strip().splitlines()[-1].removeprefix("Error: ").rstrip(".") if str(e) else "damaged"
+        raise InputError(f"{path}: Blender cannot read it ({reason}); export it again.") from None
+    for ob in list(bpy.data.objects):
+        if ob.type in ("LIGHT", "CAMERA", "LIGHT_PROBE", "SPEAKER"):
+            bpy.data.objects.remove(ob)
+    _hide_bone_shapes()
+    _check_meshes(path)
+    warnings = _check_textures(path)
+    rest = rest_pose()  # before anything is evaluated: the first frame_set would overwrite it
+    imported = suffix in (".glb", ".gltf", ".fbx", ".obj")
+    return Asset(path, digest, find_clips(imported), warnings, rest)
+
+
+def _load(path: Path, suffix: str) -> None:
+    name = str(path.resolve())
+    if suffix == ".blend":
+        bpy.ops.wm.open_mainfile(filepath=name, load_ui=False, use_scripts=False)
+    elif suffix in (".glb", ".gltf"):
+        bpy.ops.import_scene.gltf(filepath=name)
+    elif suffix == ".fbx" and hasattr(bpy.types, "WM_OT_fbx_import"):
+        bpy.ops.wm.fbx_import(filepath=name)
+    elif suffix == ".fbx":
+        bpy.ops.import_scene.fbx(filepath=name)
+    elif suffix == ".obj":
+        bpy.ops.wm.obj_import(filepath=name)
+    else:
+        bpy.ops.wm.usd_import(filepath=name, import_all_materials=True)
+
+
+def _check_gltf(path: Path) -> None:
+    """What the importer would find out late, or not at all: a cut file, files beside it that are missing or
+    lie elsewhere."""
+    data = path.read_bytes()
+    try:
+        if path.suffix.lower() == ".glb":
+            magic, version, length, chunk = struct.unpack_from("<4sIII", data)
+            if magic != b"glTF" or version != 2:
+                raise ValueError("not a binary glTF 2.0 file")
+            if length > len(data):
+                raise ValueError(f"cut off after {len(data)} of {length} bytes")
+            data = data[20 : 20 + chunk]
+        document = json.loads(data)
+        used = [(kind, x.get("uri")) for kind in ("buffers", "images") for x in document.get(kind, [])]
+    except (ValueError, struct.error, AttributeError, TypeError) as e:
+        raise InputError(f"{path}: it is damaged ({e}); export it again.") from None
+    for kind, uri in used:
+        if not uri or uri.startswith("data:"):
+            continue
+        file = _inside(path, uri)
+        if kind == "buffers" and not file.is_file():
+            raise InputError(f"{path}: its data file {uri} is missing; put it beside it.")
+
+
+def _inside(path: Path, reference: str) -> Path:
+    """Where a file named by the asset lies; InputError if that is not below the asset's folder."""
+    folder = path.resolve().parent
+    file = (folder / reference).resolve()
+    if not file.is_relative_to(folder):
+        raise InputError(
+            f"{path}: it refers to {reference}, outside of its own folder; pack it into the file or copy it beside it."
+        )
+    return file
+
+
+def _hide_bone_shapes() -> None:
+    """Importers make small meshes that draw bones; a render would show them and bounds would count them."""
+    for ob in bpy.data.objects:
+        for bone in ob.pose.bones if ob.pose else ():
+            if bone.custom_shape:
+                bone.custom_shape.hide_render = bone.custom_shape.hide_viewport = True
+
+
+def _check_meshes(path: Path) -> None:
+    shapes = (*bpy.data.curves, *bpy.data.metaballs)
+    meshes = {ob.data for ob in bpy.context.scene.objects if ob.type == "MESH" and not ob.hide_render}
+    if not shapes and not any(len(m.vertices) for m in meshes):
+        raise InputError(f"{path}: there is no mesh in it; give a file with visible geometry.")
+    for mesh in meshes:
+        check_vertices(path, mesh.name, vertices(mesh))
+
+
+def check_vertices(path: Path, name: str, points: np.ndarray) -> None:
+    """InputError unless all coordinates are finite and within LARGEST."""
+    if points.size and not np.abs(points).max() <= LARGEST:
+        raise InputError(
+            f"{path}: the mesh {name} has vertices that are not finite or beyond {LARGEST:.0e}; repair it."
+        )
+
+
+def _check_textures(path: Path) -> list[str]:
+    warnings = []
+    for image in bpy.data.images:
+        if image.source not in ("FILE", "SEQUENCE", "MOVIE", "TILED"):
+            continue
+        if not image.packed_file and image.filepath:
+            _inside(path, bpy.path.abspath(image.filepath, library=image.library))
+        if image.users and not (image.has_data or image.size[0]):  # size[0] makes Blender try to load it
+            warnings.append(f"{path}: the texture {image.name} is missing or damaged; it is rendered light grey.")
+            image.source = "GENERATED"
+            image.generated_width = image.generated_height = 1
+            image.generated_color = (0.8, 0.8, 0.8, 1.0)
+    return warnings
+
+
+# ---------------------------------------------------------------- lending the scene
+
+
+def shown_objects(scene, view_layer) -> list:
+    """The objects of the scene that a render of the view layer could show: those in a collection that is
+    neither excluded nor hidden from renders. (An object's own hide_render may be animated; it is kept.)"""
+    shown = {}
+
+    def walk(layer, hidden):
+        hidden = hidden or layer.exclude or layer.collection.hide_render
+        if not hidden:
+            shown.update((ob.name, ob) for ob in layer.collection.objects)
+        for child in layer.children:
+            walk(child, hidden)
+
+    walk(view_layer.layer_collection, False)
+    return [ob for ob in scene.objects if ob.name in shown]
+
+
+@contextlib.contextmanager
+def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
+    """A throw-away copy of the open scene with one view layer, to change and to step through at will.
+
+    objects: what it contains; None = all that renders show; lights False leaves light objects out.
+    On leaving, the copy is gone and the scene's own frame is evaluated again.
+    """
+    source, layer = bpy.context.scene, bpy.context.view_layer
+    keep = shown_objects(source, layer) if objects is None else list(objects)
+    stage = source.copy()
+    try:
+        for other in [x for x in stage.view_layers if x.name != layer.name]:
+            stage.view_layers.remove(other)
+        for child in list(stage.collection.children):
+            stage.collection.children.unlink(child)
+        for ob in list(stage.collection.objects):
+            stage.collection.objects.unlink(ob)
+        for ob in keep:
+            if ob.type != "CAMERA" and (lights or ob.type != "LIGHT"):
+                stage.collection.objects.link(ob)
+        yield stage
+    finally:
+        bpy.data.scenes.remove(stage)
+        source.frame_set(source.frame_current, subframe=source.frame_subframe)
+
+
+# ---------------------------------------------------------------- measuring
+
+
+def vertices(mesh) -> np.ndarray:
+    """(N,3) float64 local coordinates of a mesh."""
+    flat = np.empty(len(mesh.vertices) * 3, np.float32)
+    mesh.vertices.foreach_get("co", flat)
+    return flat.reshape(-1, 3).astype(np.float64)
+
+
+def world_vertices(stage) -> list[tuple[str, np.ndarray]]:
+    """(object name, (N,3) world coordinates) of each mesh instance shown by the evaluated scene `stage`."""
+    found = []
+    for instance in stage.view_layers[0].depsgraph.object_instances:
+        ob = instance.object
+        hidden = ob.hide_render or (instance.parent and instance.parent.hide_render)
+        if ob.type != "MESH" or hidden or not instance.show_self or not len(ob.data.vertices):
+            continue
+        matrix = np.array(instance.matrix_world)
+        found.append((ob.name, vertices(ob.data) @ matrix[:3, :3].T + matrix[:3, 3]))
+    return found
+
+
+def normalisation(
+    frames: list[int], objects: list | None = None, name: str = "scene"
+) -> tuple[Normalisation, np.ndarray]:
+    """Bounds of the visible meshes of the open scene over all scene frames given: the Normalisation (box
+    centre, longest half-side) and the box itself, (2,3), in normalised units. Raises InputError (with `name`)
+    where nothing is visible, a vertex is not finite or too far out, or everything is one point."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    with borrowed(objects) as stage:
+        for frame in dict.fromkeys(frames):
+            stage.frame_set(frame)
+            for part, points in world_vertices(stage):
+                check_vertices(name, part, points)
+                low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
+    if not np.isfinite(low).all():
+        raise InputError(f"{name}: no mesh is visible in frames {frames[0]} to {frames[-1]}; choose others.")
+    centre, scale = (low + high) / 2, float((high - low).max() / 2)
+    if not scale > 1e-9:
+        raise InputError(f"{name}: all vertices lie at one point; give an object that has a size.")
+    norm = Normalisation(scale, tuple(float(x) for x in centre))
+    return norm, np.stack([low - centre, high - centre]) / scale
+
+
+def motion(frames: list[int], objects: list | None = None) -> float:
+    """How much moves: the mean over all vertices of the largest distance from where they were at the first
+    of the frames, in units of the longest half-side of the box over those frames; 0 for what holds still.
+    Meshes whose vertex count changes are left out."""
+    tracks: dict[int, list[np.ndarray]] = {}
+    with borrowed(objects) as stage:
+        for frame in dict.fromkeys(frames):
+            stage.frame_set(frame)
+            for i, (_, points) in enumerate(world_vertices(stage)):
+                tracks.setdefault(i, []).append(points)
+    whole = [t for t in tracks.values() if all(len(p) == len(t[0]) for p in t)]
+    if not whole:
+        return 0.0
+    low = np.min([p.min(0) for t in whole for p in t], 0)
+    high = np.max([p.max(0) for t in whole for p in t], 0)
+    moved = np.concatenate([np.max([np.linalg.norm(p - t[0], axis=1) for p in t], 0) for t in whole])
+    return float(moved.mean() / max((high - low).max() / 2, 1e-9))
+
+
+def most_moving(asset: Asset, count: int = 24) -> Clip:
+    """The clip in whose first `count` frames the vertices move most, judged by six of them."""
+    if len(asset.clips) == 1:
+        return asset.clips[0]
+
+    def moves(clip: Clip) -> float:
+        asset.play(clip)
+        frames = clip.frames(count)
+        return motion([frames[round(i * (len(frames) - 1) / 5)] for i in range(6)])
+
+    return max(asset.clips, key=moves)
