@@ -86,10 +86,9 @@ def render_assets(
     progress(done, len(names), images)
 
     jobs = max(1, min(jobs, len(todo)))
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     free: SimpleQueue[list[int]] = SimpleQueue()
     for i in range(jobs):  # one core each: twice as efficient as threads that wait for each other
-        free.put([cores[i % len(cores)]] if cores and jobs > 1 else [])
+        free.put([cores()[i % len(cores())]] if jobs > 1 else [])
     events: SimpleQueue[tuple[str, dict | None]] = SimpleQueue()
     running: set[subprocess.Popen] = set()
 
@@ -173,6 +172,13 @@ def expand(assets: list[str]) -> list[str]:
         else:
             found.append(asset)
     return list(dict.fromkeys(found))
+
+
+def cores() -> list[int]:
+    """The processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
 
 
 def stem(asset: str) -> str:
@@ -323,7 +329,7 @@ def _child_main(job_file: str, log: str) -> int:
     sink = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(sink, 1)
     os.dup2(sink, 2)
-    if job["cores"]:
+    if job["cores"] and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, job["cores"])  # before Blender starts its threads
     say = lambda message: print(json.dumps(message), file=out)  # noqa: E731
     try:
@@ -360,7 +366,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--displace", action="store_true", help="still objects, moved a little along a line")
     parser.add_argument("--seed", type=int, default=d.seed)
     parser.add_argument("--device", default=d.device, choices=["CPU", "GPU"])
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="assets at a time, one core each")
+    parser.add_argument("--jobs", type=int, default=len(cores()), metavar="N", help="assets at a time (%(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -194,7 +194,7 @@ def read_passes(path: Path, shape: tuple[int, int]) -> Passes:
         )
     if np.isnan(depth).any() or not all(np.isfinite(x).all() for x in flow):
         raise InputError(f"{path}: the depth pass holds NaN or infinite motion; render the Sequence again.")
-    depth[depth <= 0] = np.inf
+    depth[(depth <= 0) | (depth >= 1e9)] = np.inf
     return Passes(depth, *flow)
 
 
