@@ -82,7 +82,7 @@ class Asset:
         dt = np.float32(time) - self.t
         with np.errstate(under="ignore", over="ignore"):
             opacity = self.opacity * np.exp(-0.5 * (dt / self.sigma_t) ** 2)
-        return self.xyz + self.velocity * dt[:, None], opacity
+            return self.xyz + self.velocity * dt[:, None], opacity
 
     def frame_to_time(self, frame):
         """Model time of a (fractional) frame number of the clip: frame_start is -1, frame_end is +1."""
@@ -123,6 +123,23 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
         raise bad("fps and scale must be positive and finite, and translation finite")
     if len(c.translation) != 3 or c.frame_end < c.frame_start:
         raise bad("the clip's frame range is empty or its translation is not three numbers")
+
+
+def rotation_matrices(q: np.ndarray) -> np.ndarray:
+    """q (N,4) unit quaternions w x y z -> (N,3,3) rotation matrices."""
+    w, x, y, z = q.T
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def linear_from_srgb(rgb: np.ndarray) -> np.ndarray:
+    """sRGB-encoded values (any shape) -> linear light, clamped to 0..1."""
+    x = np.clip(rgb, 0, 1)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @contextmanager
