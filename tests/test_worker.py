@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The worker's protocol, spoken to as the add-on does: a process, JSON in, JSON lines out."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from timesplat.datagen.sequence import Passes, Sequence, View, focal_from_fov, opengl_to_opencv, write_passes
+from timesplat.datagen.sequence import write_sequence as write
+from timesplat.model.asset import read_ply
+
+
+def ask(*argv, stdin="", code=None):
+    command = [sys.executable, "-c", code] if code else [sys.executable, "-m", "timesplat.model.worker"]
+    run = subprocess.run([*command, *map(str, argv)], input=stdin, capture_output=True, text=True, timeout=120)
+    return run.returncode, [json.loads(line) for line in run.stdout.splitlines()], run.stderr
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A sphere of radius 0.6 that stands still, seen by four cameras at four frames."""
+    from PIL import Image
+    from timesplat.datagen.rigs import alternating
+
+    size = 32
+    focal = focal_from_fov(50, size)
+    shots = alternating(list(range(4)))
+    views = [View(s.frame, s.camera, s.rig, s.c2w, focal, focal, size / 2, size / 2) for s in shots]
+    seq = Sequence(size, size, 24.0, 0, 3, views=views)
+
+    def fill(folder):
+        y, x = np.mgrid[:size, :size] + 0.5
+        d = np.stack([(x - size / 2) / focal, (y - size / 2) / focal, np.ones_like(x)], -1)
+        for i, v in enumerate(views):
+            c2w = opengl_to_opencv(v.c2w)
+            ray = d @ c2w[:3, :3].T
+            a, b, c = (ray**2).sum(-1), ray @ c2w[:3, 3], (c2w[:3, 3] ** 2).sum() - 0.36
+            hit = b * b - a * c > 0
+            z = np.where(hit, (-b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf).astype(np.float32)
+            rgba = np.dstack([np.full((size, size, 3), 180), hit * 255]).astype(np.uint8)
+            v.image, v.passes = f"{i}.png", f"{i}.exr"
+            Image.fromarray(rgba).save(folder / v.image)
+            write_passes(folder / v.passes, Passes(z, *np.zeros((2, size, size, 2), np.float32)))
+
+    folder = tmp_path_factory.mktemp("worker") / "sphere"
+    write(seq, folder, fill)
+    return folder
+
+
+def test_lift(tmp_path, sequence):
+    asset = tmp_path / "a.ply"
+    (tmp_path / "r.json").write_text(json.dumps({"sequence": str(sequence), "asset": str(asset), "method": "lift"}))
+    code, said, _ = ask(tmp_path / "r.json")
+    assert code == 0 and said[-1]["event"] == "done" and said[-1]["asset"] == str(asset)
+    steps = [s["fraction"] for s in said[:-1]]
+    assert len(steps) > 2 and steps == sorted(steps) and all(s["event"] == "progress" and s["text"] for s in said[:-1])
+    a = read_ply(asset)
+    assert len(a) == said[-1]["gaussians"] > 100 and (a.clip.frame_start, a.clip.frame_end) == (0, 3)
+    assert np.abs(np.linalg.norm(a.xyz, axis=1) - 0.6).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("request_", "word"),
+    [
+        ("", "cannot be read"),
+        ("{", "cannot be read"),
+        ("[]", "not an object"),
+        ('{"asset": "a.ply"}', "sequence is missing"),
+        ('{"sequence": 3, "asset": "a"}', "sequence must be of type str"),
+        ('{"sequence": "nowhere", "asset": "a.ply", "method": "lift"}', "nowhere"),
+        ('{"colour": 1}', "unknown key colour"),
+    ],
+)
+def test_bad_requests_are_answered_with_one_sentence(request_, word):
+    code, said, _ = ask(stdin=request_ + "\n")
+    assert code == 1 and said[-1]["event"] == "error"
+    assert word in said[-1]["message"] and "\n" not in said[-1]["message"]
+
+
+NOISY = """
+import os, sys
+from timesplat.model import worker
+def noisy(request, progress):
+    print("a library speaks")
+    os.write(1, b"and C too\\n")
+    os.system("echo and a child")
+    progress(0.5, "half")
+    raise RuntimeError("many\\nlines")
+worker._reconstruct = noisy
+sys.exit(worker.main([]))
+"""
+
+
+def test_what_libraries_print_does_not_reach_the_protocol():
+    code, said, err = ask(stdin='{"sequence": "a", "asset": "b"}\n', code=NOISY)
+    assert [s["event"] for s in said] == ["progress", "error"] and code == 1
+    assert said[1]["message"] == "The reconstruction stopped with RuntimeError: many lines"
+    for words in ("a library speaks", "and C too", "and a child", "Traceback"):
+        assert words in err
+
+
+WAITING = """
+import sys, time
+from timesplat.model import worker
+worker._reconstruct = lambda request, progress: (progress(0, "x"), time.sleep(60))
+sys.exit(worker.main([]))
+"""
+
+
+def test_it_leaves_when_the_program_that_asked_is_gone():
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", WAITING], stdin=pipe, stdout=pipe, text=True) as p:
+        p.stdin.write('{"sequence": "a", "asset": "b", "watch": true}\n')
+        p.stdin.flush()
+        assert "progress" in p.stdout.readline()
+        time.sleep(0.2)
+        assert p.poll() is None
+        p.stdin.close()
+        assert p.wait(10) == 3
