@@ -51,7 +51,7 @@ def _operator(op, lane, out, emit):
 
     @infer_global(op)
     class _Typing(ConcreteTemplate):
-        cases = [signature(out, lane, lane)]
+        cases = (signature(out, lane, lane),)
 
     @lower_builtin(op, lane, lane)
     def _lower(context, builder, sig, args):
@@ -69,7 +69,7 @@ _operator(operator.and_, mask8, mask8, lambda b, x, y: b.and_(x, y))
 
 @infer_global(operator.neg)
 class _Neg(ConcreteTemplate):
-    cases = [signature(f32x8, f32x8)]
+    cases = (signature(f32x8, f32x8),)
 
 
 @lower_builtin(operator.neg, f32x8)
