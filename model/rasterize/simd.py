@@ -63,6 +63,7 @@ _operator(operator.sub, f32x8, f32x8, lambda b, x, y: b.fsub(x, y))
 _operator(operator.mul, f32x8, f32x8, lambda b, x, y: b.fmul(x, y))
 _operator(operator.truediv, f32x8, f32x8, lambda b, x, y: b.fdiv(x, y))
 _operator(operator.gt, f32x8, mask8, lambda b, x, y: b.fcmp_ordered(">", x, y))
+_operator(operator.lt, f32x8, mask8, lambda b, x, y: b.fcmp_ordered("<", x, y))
 _operator(operator.ge, f32x8, mask8, lambda b, x, y: b.fcmp_ordered(">=", x, y))
 _operator(operator.and_, mask8, mask8, lambda b, x, y: b.and_(x, y))
 
