@@ -22,28 +22,22 @@ import torch
 
 from . import project
 from .project import (
-    BLUE, E_MIN, F32, GREEN, HU, HUU, HUV, HV, HVV, INVERSE, LOG, MX, MY, REACH_Y, RED, SLOPE, SUMS, TILE,
+    BLUE, E_MIN, F32, GREEN, HU, HUU, HUV, HV, HVV, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE,
     UX, UY, VY, H, serial,
 )  # fmt: skip
 from .simd import any_lane, exp2, fma, load, ramp, select, splat, store, total
 
 STRIDE = TILE + 8  # a span may run up to seven pixels over the tile's right edge, into scratch
 HALF, SLACK = F32(0.5), F32(1e-3)  # slack: rounding of a span's ends; the pixels decide exactly
-ALPHA_MAX, T_STOP = F32(0.999), F32(1e-4)
+ALPHA_MAX, T_STOP, ZERO = F32(0.999), F32(1e-4), F32(0)
+WIDE = 8  # from this width on (pixels, less one) each row finds its own span; below, the box is one step anyway
 
 
 @serial
-def _rows(my, ry, y0, h):
-    """The rows [a, b] of [y0, y0 + h) whose centres lie within ry of my. (No ceil or floor: they are calls.)"""
-    low, high = max(my - ry - HALF, F32(y0)), min(my + ry - HALF, F32(y0 + h - 1))
-    a = int(low)
-    return a + (F32(a) < low), (int(high) if high >= 0 else -1)
-
-
-@serial
-def _span(centre, half, x0, x1):
-    """The pixels [a, b] of [x0, x1] that may lie within `half` of `centre` (both less half a pixel)."""
-    low, high = max(centre - half, F32(x0)), min(centre + half, F32(x1))
+def _inside(centre, half, x0, n):
+    """The pixels [a, b] of [x0, x0 + n) whose centres lie within `half` of `centre`; b may be one too many at the
+    left edge. (No ceil or floor: they are library calls.)"""
+    low, high = max(centre - half - HALF, F32(x0)), min(centre + half - HALF, F32(x0 + n - 1))
     a = int(low)
     return a + (F32(a) < low), (int(high) if high >= 0 else -1)
 
@@ -59,19 +53,19 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state):
     zero, lowest, highest, stop = splat(F32(0)), splat(E_MIN), splat(ALPHA_MAX), splat(T_STOP)
     for i in range(first, last):
         r = pairs[i]
-        my, ry = P[r, MY], P[r, REACH_Y]
         ux, red, green, blue = splat(P[r, UX]), splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE])
         index = splat(F32(i - first + 1))
-        mx, uy, vy, log = P[r, MX], P[r, UY], P[r, VY], P[r, LOG]
+        mx, my, uy, vy, log = P[r, MX], P[r, MY], P[r, UY], P[r, VY], P[r, LOG]
         inverse, slope = P[r, INVERSE], P[r, SLOPE]
-        top, bottom = _rows(my, ry, y0, h)
+        top, bottom = _inside(my, P[r, REACH_Y], y0, h)
+        a, b = _inside(mx, P[r, REACH_X], x0, w)
+        wide = b - a >= WIDE
         for y in range(top, bottom + 1):
             dy = F32(y) + HALF - my
             v = vy * dy
             k = log - v * v
-            if k < E_MIN:
-                continue
-            a, b = _span(mx - slope * dy - HALF, math.sqrt(k - E_MIN) * inverse + SLACK, x0, x0 + w - 1)
+            if wide:
+                a, b = _inside(mx - slope * dy, math.sqrt(max(k - E_MIN, ZERO)) * inverse + SLACK, x0, w)
             row = (y - y0) * 5 * STRIDE - x0
             for x in range(a, b + 1, 8):
                 at = row + x
@@ -105,21 +99,21 @@ def _unblend(P, pairs, first, last, x0, y0, w, h, state, sums):
     zero, one, lowest, highest = splat(F32(0)), splat(F32(1)), splat(E_MIN), splat(ALPHA_MAX)
     for i in range(last - 1, first - 1, -1):
         r = pairs[i]
-        my, ry = P[r, MY], P[r, REACH_Y]
         ux, red, green, blue = splat(P[r, UX]), splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE])
         index = splat(F32(i - first + 1))
         s_red, s_green, s_blue, s_h, s_hu, s_hv = zero, zero, zero, zero, zero, zero
         s_huu, s_huv, s_hvv = zero, zero, zero
-        mx, uy, vy, log = P[r, MX], P[r, UY], P[r, VY], P[r, LOG]
+        mx, my, uy, vy, log = P[r, MX], P[r, MY], P[r, UY], P[r, VY], P[r, LOG]
         inverse, slope = P[r, INVERSE], P[r, SLOPE]
-        top, bottom = _rows(my, ry, y0, h)
+        top, bottom = _inside(my, P[r, REACH_Y], y0, h)
+        a, b = _inside(mx, P[r, REACH_X], x0, w)
+        wide = b - a >= WIDE
         for y in range(top, bottom + 1):
             dy = F32(y) + HALF - my
             v = vy * dy
             k = log - v * v
-            if k < E_MIN:
-                continue
-            a, b = _span(mx - slope * dy - HALF, math.sqrt(k - E_MIN) * inverse + SLACK, x0, x0 + w - 1)
+            if wide:
+                a, b = _inside(mx - slope * dy, math.sqrt(max(k - E_MIN, ZERO)) * inverse + SLACK, x0, w)
             row = (y - y0) * 6 * STRIDE - x0
             for x in range(a, b + 1, 8):
                 at = row + x

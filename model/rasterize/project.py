@@ -164,29 +164,42 @@ def _prepare(c, ids, P, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intri
 
 
 @serial
-def _bin(P, width, height, at, pairs, write):
-    """Counts (at[tile] += 1) or, with `write`, lists (pairs[at[tile]++] = row) the rows of P in the
-    tiles that they reach: per row of tiles the exact extent of the ellipse in that band."""
+def _bin(P, width, height):
+    """-> starts (tiles + 1), pairs: tile j is reached by the rows pairs[starts[j] : starts[j + 1]] of P, in order.
+    Per row of tiles the exact extent of the ellipse in that band counts, not its box."""
     across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    tile, row, n = np.empty(4 * len(P) + 64, np.int32), np.empty(4 * len(P) + 64, np.int32), 0
+    starts = np.zeros(across * down + 1, np.int64)
     for r in range(len(P)):
-        if P[r, REACH_X] < 0:
+        rx, ry = np.float64(P[r, REACH_X]), np.float64(P[r, REACH_Y])
+        if rx < 0:
             continue
-        mx, my, ry = np.float64(P[r, MX]), np.float64(P[r, MY]), np.float64(P[r, REACH_Y])
-        ux, vy = np.float64(P[r, UX]), np.float64(P[r, VY])
-        slope, s = P[r, SLOPE], np.float64(P[r, LOG] - E_MIN)
-        for ty in range(int(max(my - ry, 0.0)) // TILE, min(int(min(my + ry, height - 1.0)) // TILE, down - 1) + 1):
-            low, high = max(ty * TILE - my, -ry), min(ty * TILE + TILE - my, ry)
-            dy = min(max(-P[r, TILT], low), high)
-            left = mx - slope * dy - math.sqrt(max(s - (vy * dy) ** 2, 0.0)) / ux - 0.01
-            dy = min(max(P[r, TILT], low), high)
-            right = mx - slope * dy + math.sqrt(max(s - (vy * dy) ** 2, 0.0)) / ux + 0.01
-            if right < 0 or left > width:
-                continue
-            for tx in range(int(max(left, 0.0)) // TILE, min(int(min(right, width - 1.0)) // TILE, across - 1) + 1):
-                tile = ty * across + tx
-                if write:
-                    pairs[at[tile]] = r
-                at[tile] += 1
+        mx, my = np.float64(P[r, MX]), np.float64(P[r, MY])
+        top, bottom = int(max(my - ry, 0.0)) // TILE, int(min(my + ry, height - 1.0)) // TILE
+        if n + (bottom - top + 1) * across > len(tile):
+            tile = np.concatenate((tile, np.empty(len(tile) + across * down, np.int32)))
+            row = np.concatenate((row, np.empty(len(tile) - len(row), np.int32)))
+        left, right = mx - rx, mx + rx
+        for ty in range(top, bottom + 1):
+            if rx > TILE // 2:
+                low, high = max(ty * TILE - my, -ry), min(ty * TILE + TILE - my, ry)
+                a, b = min(max(-P[r, TILT], low), high), min(max(P[r, TILT], low), high)
+                s, vy = P[r, LOG] - E_MIN, P[r, VY]
+                left = mx - P[r, SLOPE] * a - math.sqrt(max(s - (vy * a) ** 2, 0.0)) * P[r, INVERSE] - 0.01
+                right = mx - P[r, SLOPE] * b + math.sqrt(max(s - (vy * b) ** 2, 0.0)) * P[r, INVERSE] + 0.01
+                if right < 0 or left > width:
+                    continue
+            for tx in range(int(max(left, 0.0)) // TILE, int(min(right, width - 1.0)) // TILE + 1):
+                tile[n], row[n] = ty * across + tx, r
+                starts[tile[n] + 1] += 1
+                n += 1
+    for j in range(across * down):
+        starts[j + 1] += starts[j]
+    pairs, at = np.empty(n, np.int32), starts.copy()
+    for i in range(n):
+        pairs[at[tile[i]]] = row[i]
+        at[tile[i]] += 1
+    return starts, pairs
 
 
 @serial
@@ -196,13 +209,7 @@ def project_view(c, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intrinsic
     ids = _sort(*_cull(c, xyz, t, velocity, sigma_t, opacity, c2w, time, inference))
     P = np.empty((len(ids), PARAMS), np.float32)
     _prepare(c, ids, P, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intrinsics, time, width, height)
-    tiles = ((width + TILE - 1) // TILE) * ((height + TILE - 1) // TILE)
-    starts = np.zeros(tiles + 1, np.int64)
-    _bin(P, width, height, starts[1:], np.empty(0, np.int32), False)
-    for j in range(tiles):
-        starts[j + 1] += starts[j]
-    pairs = np.empty(starts[tiles], np.int32)
-    _bin(P, width, height, starts[:tiles].copy(), pairs, True)
+    starts, pairs = _bin(P, width, height)
     return ids, P, starts, pairs
 
 
