@@ -164,21 +164,30 @@ def _prepare(c, ids, P, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intri
 
 
 @serial
+def _tiles(low, high, n):
+    """First and last tile of n pixels that [low, high] touches; it touches one."""
+    return int(max(low, 0.0)) // TILE, int(min(high, n - 1.0)) // TILE
+
+
+@serial
 def _bin(P, width, height):
     """-> starts (tiles + 1), pairs: tile j is reached by the rows pairs[starts[j] : starts[j + 1]] of P, in order.
     Per row of tiles the exact extent of the ellipse in that band counts, not its box."""
     across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    tile, row, n = np.empty(4 * len(P) + 64, np.int32), np.empty(4 * len(P) + 64, np.int32), 0
+    bound, n = 0, 0  # by boxes; an array that grew in the loop would cost reference counts on every turn
+    for r in range(len(P)):
+        if P[r, REACH_X] >= 0:
+            left, right = _tiles(P[r, MX] - P[r, REACH_X], P[r, MX] + P[r, REACH_X], width)
+            top, bottom = _tiles(P[r, MY] - P[r, REACH_Y], P[r, MY] + P[r, REACH_Y], height)
+            bound += (right - left + 2) * (bottom - top + 2)
+    tile, row = np.empty(bound, np.int32), np.empty(bound, np.int32)
     starts = np.zeros(across * down + 1, np.int64)
     for r in range(len(P)):
         rx, ry = np.float64(P[r, REACH_X]), np.float64(P[r, REACH_Y])
         if rx < 0:
             continue
         mx, my = np.float64(P[r, MX]), np.float64(P[r, MY])
-        top, bottom = int(max(my - ry, 0.0)) // TILE, int(min(my + ry, height - 1.0)) // TILE
-        if n + (bottom - top + 1) * across > len(tile):
-            tile = np.concatenate((tile, np.empty(len(tile) + across * down, np.int32)))
-            row = np.concatenate((row, np.empty(len(tile) - len(row), np.int32)))
+        top, bottom = _tiles(my - ry, my + ry, height)
         left, right = mx - rx, mx + rx
         for ty in range(top, bottom + 1):
             if rx > TILE // 2:
@@ -189,7 +198,8 @@ def _bin(P, width, height):
                 right = mx - P[r, SLOPE] * b + math.sqrt(max(s - (vy * b) ** 2, 0.0)) * P[r, INVERSE] + 0.01
                 if right < 0 or left > width:
                     continue
-            for tx in range(int(max(left, 0.0)) // TILE, int(min(right, width - 1.0)) // TILE + 1):
+            first, last = _tiles(left, right, width)
+            for tx in range(first, last + 1):
                 tile[n], row[n] = ty * across + tx, r
                 starts[tile[n] + 1] += 1
                 n += 1
