@@ -20,16 +20,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 
-from . import project
+from . import ALPHA_MAX, T_STOP, project
 from .project import (
     BLUE, E_MIN, F32, GREEN, HU, HUU, HUV, HV, HVV, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE,
     UX, UY, VY, H, serial,
 )  # fmt: skip
 from .simd import any_lane, exp2, fma, load, ramp, select, splat, store, total
 
+CELL, ACROSS = 8, TILE // 8  # a tile is ACROSS² cells of CELL² pixels, so that what is hidden costs one look
 STRIDE = TILE + 8  # a span may run up to seven pixels over the tile's right edge, into scratch
 HALF, SLACK = F32(0.5), F32(1e-3)  # slack: rounding of a span's ends; the pixels decide exactly
-ALPHA_MAX, T_STOP, ZERO = F32(0.999), F32(1e-4), F32(0)
+HIGHEST, STOP, ZERO = F32(ALPHA_MAX), F32(T_STOP), F32(0)
 WIDE = 8  # from this width on (pixels, less one) each row finds its own span; below, the box is one step anyway
 
 
@@ -43,15 +44,41 @@ def _inside(centre, half, x0, n):
 
 
 @serial
-def _blend(P, pairs, first, last, x0, y0, w, h, state):
+def _refresh(state, live):
+    """Marks the cells where every pixel has stopped; how many have not."""
+    count = 0
+    for cell in range(ACROSS * ACROSS):
+        if live[cell]:
+            at = cell // ACROSS * CELL * 5 * STRIDE + cell % ACROSS * CELL
+            live[cell] = False
+            for y in range(CELL):
+                live[cell] |= any_lane(load(state, at + y * 5 * STRIDE) > splat(ZERO))
+            count += live[cell]
+    return count
+
+
+@serial
+def _reaches(cells, least, a, b, top, bottom):
+    """Whether any cell under the box of pixels (relative to the tile) has at least the value `least`."""
+    for y in range(top // CELL, bottom // CELL + 1):
+        for x in range(a // CELL, b // CELL + 1):
+            if cells[y * ACROSS + x] >= least:
+                return True
+    return False
+
+
+@serial
+def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
     """Blends one tile into state, planes T r g b index by row of pixels. T < 0: stopped with |T| left."""
+    state[:] = 0
+    live[:] = 1
     for y in range(h):
-        for x in range(STRIDE):
+        for x in range(w):
             state[y * 5 * STRIDE + x] = 1
-            for plane in range(1, 5):
-                state[(y * 5 + plane) * STRIDE + x] = 0
-    zero, lowest, highest, stop = splat(F32(0)), splat(E_MIN), splat(ALPHA_MAX), splat(T_STOP)
+    zero, lowest, highest, stop = splat(F32(0)), splat(E_MIN), splat(HIGHEST), splat(STOP)
     for i in range(first, last):
+        if (i - first) % 64 == 0 and _refresh(state, live) == 0:
+            break
         r = pairs[i]
         ux, red, green, blue = splat(P[r, UX]), splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE])
         index = splat(F32(i - first + 1))
@@ -59,6 +86,8 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state):
         inverse, slope = P[r, INVERSE], P[r, SLOPE]
         top, bottom = _inside(my, P[r, REACH_Y], y0, h)
         a, b = _inside(mx, P[r, REACH_X], x0, w)
+        if not _reaches(live, 1, a - x0, b - x0, top - y0, bottom - y0):
+            continue
         wide = b - a >= WIDE
         for y in range(top, bottom + 1):
             dy = F32(y) + HALF - my
@@ -93,10 +122,11 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state):
 
 
 @serial
-def _unblend(P, pairs, first, last, x0, y0, w, h, state, sums):
+def _unblend(P, pairs, first, last, x0, y0, w, h, state, deep, sums):
     """Backward through one tile: state has planes T, B (the colour behind, dotted with the gradient, over its
-    own transmittance), dL/dr, dL/dg, dL/db, index. Rows [first, last) of sums are written."""
-    zero, one, lowest, highest = splat(F32(0)), splat(F32(1)), splat(E_MIN), splat(ALPHA_MAX)
+    own transmittance), dL/dr, dL/dg, dL/db, index; deep: the highest index per cell. Writes the rows
+    [first, last) of sums."""
+    zero, one, lowest, highest = splat(F32(0)), splat(F32(1)), splat(E_MIN), splat(HIGHEST)
     for i in range(last - 1, first - 1, -1):
         r = pairs[i]
         ux, red, green, blue = splat(P[r, UX]), splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE])
@@ -107,6 +137,9 @@ def _unblend(P, pairs, first, last, x0, y0, w, h, state, sums):
         inverse, slope = P[r, INVERSE], P[r, SLOPE]
         top, bottom = _inside(my, P[r, REACH_Y], y0, h)
         a, b = _inside(mx, P[r, REACH_X], x0, w)
+        if not _reaches(deep, i - first + 1, a - x0, b - x0, top - y0, bottom - y0):
+            sums[i] = 0
+            continue
         wide = b - a >= WIDE
         for y in range(top, bottom + 1):
             dy = F32(y) + HALF - my
@@ -147,11 +180,11 @@ def _blend_tiles(tiles, P, starts, pairs, background, image, alpha, left, index)
     """Renders the tiles of one view; left: what the transmittance ends at; index: the last one drawn, from 1."""
     height, width = alpha.shape
     across = (width + TILE - 1) // TILE
-    state = np.empty(TILE * 5 * STRIDE, np.float32)
+    state, live = np.empty(TILE * 5 * STRIDE, np.float32), np.empty(ACROSS * ACROSS, np.uint8)
     for j in range(tiles[0], tiles[1]):
         x0, y0 = j % across * TILE, j // across * TILE
         w, h = min(TILE, width - x0), min(TILE, height - y0)
-        _blend(P, pairs, starts[j], starts[j + 1], x0, y0, w, h, state)
+        _blend(P, pairs, starts[j], starts[j + 1], x0, y0, w, h, state, live)
         for y in range(h):
             for x in range(w):
                 at = y * 5 * STRIDE + x
@@ -167,11 +200,11 @@ def _unblend_tiles(tiles, P, starts, pairs, background, g_image, g_alpha, left, 
     """Backward through the tiles of one view: the rows [starts[j], used[j]) of sums."""
     height, width = left.shape
     across = (width + TILE - 1) // TILE
-    state = np.zeros(TILE * 6 * STRIDE, np.float32)
+    state, deep = np.zeros(TILE * 6 * STRIDE, np.float32), np.empty(ACROSS * ACROSS, np.int64)
     for j in range(tiles[0], tiles[1]):
         x0, y0 = j % across * TILE, j // across * TILE
         w, h = min(TILE, width - x0), min(TILE, height - y0)
-        deepest = F32(0)
+        deep[:] = 0
         for y in range(h):
             for x in range(w):
                 at = y * 6 * STRIDE + x
@@ -182,9 +215,10 @@ def _unblend_tiles(tiles, P, starts, pairs, background, g_image, g_alpha, left, 
                     behind += g * background[k]
                 state[at], state[at + STRIDE] = left[y0 + y, x0 + x], behind
                 state[at + 5 * STRIDE] = index[y0 + y, x0 + x]
-                deepest = max(deepest, index[y0 + y, x0 + x])
-        used[j] = starts[j] + int(deepest)
-        _unblend(P, pairs, starts[j], used[j], x0, y0, w, h, state, sums)
+                cell = y // CELL * ACROSS + x // CELL
+                deep[cell] = max(deep[cell], int(index[y0 + y, x0 + x]))
+        used[j] = starts[j] + deep.max()
+        _unblend(P, pairs, starts[j], used[j], x0, y0, w, h, state, deep, sums)
 
 
 @serial

@@ -13,16 +13,15 @@ import math
 import numpy as np
 from numba import njit
 
-TILE = 32  # pixels; see benchmarks/rasterize.py
+from . import ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR
+
+TILE = 64  # pixels a side; of 16, 32 and 64 the fastest at 128²
 F32 = np.float32
 LOG2E = math.log2(math.e)
-ALPHA_MIN = 1 / 255
 E_MIN = F32(math.log2(ALPHA_MIN))
-NEAR, BLUR, MARGIN = 0.01, 0.3, 0.3
-FILTER = 0.05  # the paper's inference filters, appendix A.2
-
-OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
-serial = njit(**OPTIONS)
+# TRAP: numba's cache watches only the file that a function is in. After a change to a constant above or to
+# simd.py, touch the files that use it.
+serial = njit(cache=True, nogil=True, error_model="numpy")
 
 # One row per surviving Gaussian and view, in depth order. (u, v) = L d whitens the pixel offset d = (dx, dy),
 # L = [[UX, UY], [0, VY]], scaled so that alpha = 2^(LOG - u² - v²). INVERSE = 1 / UX; SLOPE = UY / UX.

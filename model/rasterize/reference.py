@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import torch
 
+from . import ALPHA_MAX, ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR, T_STOP
+
 
 def project(mean, covariance, c2w, intrinsics, width, height):
     """Camera-space z (N), pixel means (N,2) and 2D covariances (N,2,2) by EWA splatting: Σ₂ = J W Σ Wᵀ Jᵀ + 0.3 I
@@ -15,15 +17,15 @@ def project(mean, covariance, c2w, intrinsics, width, height):
     W = c2w[:3, :3].T
     x, y, z = ((mean - c2w[:3, 3]) @ W.T).unbind(-1)
     fx, fy, cx, cy = intrinsics
-    z = torch.where(z >= 0.01, z, torch.ones_like(z))  # those behind are dropped by the caller; no NaN from here
-    mx, my = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
+    z = torch.where(z >= NEAR, z, torch.ones_like(z))  # those behind are dropped by the caller; no NaN from here
+    mx, my = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
     sx = torch.clamp(x / z, -cx / fx - mx, (width - cx) / fx + mx)
     sy = torch.clamp(y / z, -cy / fy - my, (height - cy) / fy + my)
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * sx / z, zero, fy / z, -fy * sy / z], -1).unflatten(-1, (2, 3))
     M = J @ W
     symmetric = 0.5 * (covariance + covariance.mT)
-    cov2 = M @ symmetric @ M.mT + 0.3 * torch.eye(2, dtype=mean.dtype)
+    cov2 = M @ symmetric @ M.mT + BLUR * torch.eye(2, dtype=mean.dtype)
     return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), cov2
 
 
@@ -42,9 +44,9 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
         marginal = torch.exp(-0.5 * (dt / sigma_t) ** 2)
         o = opacity * marginal
         z = (mean - c2w[view, :3, 3]) @ c2w[view, :3, 2]
-        keep = (z >= 0.01) & (o >= 1 / 255)
+        keep = (z >= NEAR) & (o >= ALPHA_MIN)
         if inference:
-            keep &= (marginal >= 0.05) & (o >= 0.05)
+            keep &= (marginal >= FILTER) & (o >= FILTER)
         keep = keep.nonzero()[:, 0]
         # front to back by the depth of the centre in float32; equal depths in input order
         keep = keep[torch.argsort(z[keep].detach().float(), stable=True)]
@@ -52,11 +54,11 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
         d = pixels[:, :, None] - mean2  # (H,W,K,2)
         a, b, c = cov2[:, 0, 0], cov2[:, 0, 1], cov2[:, 1, 1]
         q = 0.5 * (c * d[..., 0] ** 2 - 2 * b * d[..., 0] * d[..., 1] + a * d[..., 1] ** 2) / (a * c - b * b)
-        alpha = (o[keep] * torch.exp(-q)).clamp(max=0.999)
-        alpha = torch.where(alpha >= 1 / 255, alpha, torch.zeros_like(alpha))
+        alpha = (o[keep] * torch.exp(-q)).clamp(max=ALPHA_MAX)
+        alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
         # A Gaussian that would take the transmittance to 1e-4 or below is not drawn, nor is any behind it.
         after = torch.cumprod(1 - alpha.detach(), -1)
-        alpha = torch.where(after > 1e-4, alpha, torch.zeros_like(alpha))
+        alpha = torch.where(after > T_STOP, alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha, -1)
         before = torch.cat([torch.ones_like(after[..., :1]), after], -1)[..., :-1]
         left = 1 - (alpha * before).sum(-1) if len(keep) else torch.ones(height, width, dtype=dtype)
