@@ -129,6 +129,18 @@ def default_rig(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     return sorted(shots, key=lambda s: s.frame)  # stable: the cameras of a frame stay together
 
 
+def turntable(frames: Sequence[int], seed: int = 0) -> list[Shot]:
+    """For showing: one camera that goes once around the object over the clip, 20 degrees above it."""
+    return [
+        Shot(f, "turntable", "turntable", spherical(360 * i / len(frames), 20)) for i, f in enumerate(frames)
+    ]
+
+
+def demo_rig(frames: Sequence[int], seed: int = 0) -> list[Shot]:
+    """Alternating canonical views as input, and a turntable to show the result from."""
+    return sorted(alternating(frames, seed) + turntable(frames, seed), key=lambda s: s.frame)
+
+
 def targets(frames: Sequence[int], seed: int = 0, per_frame: int = 1) -> list[Shot]:
     """Held-out views for scoring: random poses of the rig "target". The rig's name is part of the random
     stream, so with the same seed they never repeat an input pose."""
@@ -187,5 +199,7 @@ RIGS: dict[str, Callable[[Sequence[int], int], list[Shot]]] = {
     "canonical": canonical,
     "elevated": elevated,
     "orbit": orbit,
+    "turntable": turntable,
+    "demo": demo_rig,
     **SETUPS,
 }

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ..datagen.sequence import Sequence
 from .gaussians import Gaussians4D
@@ -52,6 +53,26 @@ def evaluate_method(seq: Sequence, method: str, inputs, targets, checkpoint: Pat
     frames = {k: v.tolist() for k, v in frames.items()}
     row = summarise(frames) | {"seconds": seconds, "gaussians": len(g), "gaussians_kept": len(kept)}
     return row | {"frames": frames}, kept
+
+
+def evaluate_folders(sequences: dict[str, Sequence], methods: list[str], out: Path, checkpoint: Path | None = None):
+    """Scores every method on every Sequence {name: Sequence}: its views of rig "target" are held out, all the
+    others are input. Writes metrics.json and metrics.md below `out`, prints the table, returns the metrics."""
+    objects: dict[str, dict[str, dict]] = {}
+    bar = tqdm(total=len(sequences) * len(methods), desc="evaluating", unit="run")
+    for name, seq in sequences.items():
+        inputs = [i for i, v in enumerate(seq.views) if v.rig != "target"]
+        objects[name] = {}
+        for method in methods:
+            bar.set_postfix_str(f"{name} {method}")
+            row, _ = evaluate_method(seq, method, inputs, seq.select(rig="target"), checkpoint)
+            objects[name][method] = row
+            bar.update()
+        write_metrics(out, collect(objects))
+    bar.close()
+    metrics = collect(objects)
+    print(table(metrics))
+    return metrics
 
 
 def summarise(frames: dict[str, list[float]]) -> dict[str, float]:

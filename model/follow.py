@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Following surface points through the other views: how they move, and how long they are needed.
+"""Following surface points through time: scene flow from motion vectors, and tracks along it.
 
-Motion vectors tell how a point moves across the image but not along the ray. That component is the one
-whose straight line agrees best with the depth maps of the other views. Then the line is followed forwards
-and backwards in time until a view sees through it (there it would hide what that view saw: it must be gone)
-or sees the same surface again well enough (whose own pixel takes over from it).
+A motion vector constrains two of the three components of a point's motion. All that the views say about one
+frame interval is gathered in a voxel grid as small least-squares problems; views from different sides
+complete each other, coarser levels fill in where nothing was seen (the far side of a leg moves like its near
+side). Along this field each pixel's point is followed both ways until a view sees the same surface well
+enough (its own pixel takes over), sees through the point (it is wrong by then), or the clip ends. A track is
+cut into pieces that are straight to within a fraction of a pixel: each becomes one Gaussian.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -16,163 +20,288 @@ from torch import Tensor
 
 from .views import Views
 
-TOLERANCE = 1.5  # depth agreement, in pixel sizes, plus …
-DRIFT = 0.5  # … this per frame of extrapolation
-WINDOW = 6.0  # frames within which other views vote on the motion along the ray
-MAX_SPAN = 12.0  # frames that a Gaussian lives on where nothing contradicts it and nobody takes over
+GRID = 32  # voxels along [-EXTENT, EXTENT]
+EXTENT = 1.15
+BEYOND = (0.4, 0.1)  # weight of what is known one and two intervals away
+COARSE, COARSEST = 1e-2, 1e-5  # weights of the levels that fill in
+TOLERANCE = 2.0  # depth agreement, in pixel sizes, plus …
+DRIFT = 0.5  # … this per frame of following
+LONGEST = 8.0  # frames that a point is followed
 FRONTAL = 0.3  # a view that sees a surface under a cosine above this may take over from another
-# Candidates of the motion along the ray, in pixel sizes per frame; the prior prefers small ones.
-CANDIDATES = np.array([0, -0.25, 0.25, -0.5, 0.5, -1, 1, -1.5, 1.5, -2, 2, -3, 3, -4, 4, -6, 6], np.float32)
-PRIOR = 0.05
+HANDOVER = 0.45  # a point is needed for this part of the time until another view takes over
+STRAIGHT = 0.5  # a piece's greatest distance from its chord, in pixel sizes
+PIECES = 8  # most pieces per track
 
 
-def follow(
-    views: Views,
-    world: Tensor,  # (V,H,W,3) surface points
-    across: Tensor,  # (V,H,W,3) their motion per frame across the view
-    along: Tensor,  # (V,H,W,3) motion that keeps the pixel, per unit of depth
-    normal: Tensor,  # (V,H,W,3) unit, towards the camera
-    pixel: Tensor,  # (V,H,W) size of a pixel at the surface
-    valid: Tensor,  # (V,H,W) bool
-    depth: Tensor,  # (V,H,W) planar z where valid
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """-> velocity (V,H,W,3) per frame; before, after (V,H,W) frames that the point is needed to either side
-    of its own time; support (V,H,W) how many views agree. Zero where not valid."""
-    # Depth of each pixel for the vote: a surface, free space (inf), or unknown (-1: silhouettes).
-    seen = torch.where(valid, depth, torch.where(views.alpha < 0.02, torch.inf, -1.0))
+@dataclass
+class Points:
+    """The n surface points that V views see, in the order of their views."""
+
+    view: Tensor  # (n,) index of the view
+    place: Tensor  # (n,3) world
+    normal: Tensor  # (n,3) unit, towards the camera
+    pixel: Tensor  # (n,) size of a pixel at the surface
+    to_next: Tensor  # (n,2) motion vectors to the next frame and to the previous one, in pixels
+    to_previous: Tensor
+    depth: Tensor  # (n,) planar z
+    ray: Tensor  # (n,2) x/z and y/z in the camera
+
+
+def follow(views: Views, points: Points, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """seen (V,H,W): what each pixel shows, for comparison: planar z, free space (inf), or unknown (-1).
+
+    -> pieces (M,8): middle (frames since the clip's middle), half length in frames, place xyz at the middle,
+    velocity xyz per frame; owner (M,) index 0..n-1 of the point that each belongs to, ascending; summary
+    (n,4): frames followed before and after, how many views agree, 1 where a view contradicted it."""
     frame = views.time / views.frame_step
     last = 1 / views.frame_step if views.frame_step < 2 else 0.0
+    intervals = max(round(2 * last), 1)
+    A, next_b, previous_b = constraints(views, points)
+    field = scene_flow(views, points, A, next_b, previous_b, intervals)
+    own = torch.stack([torch.cat([A.flatten(1), b], -1) for b in (next_b, previous_b)], 1)
     w2c = torch.linalg.inv(views.c2w)
-    args = [
-        np.ascontiguousarray(x.numpy(), np.float32)
-        for x in (world, across, along, normal, pixel, frame, w2c, views.intrinsics, seen)
-    ]
-    mask = np.ascontiguousarray(valid.numpy())
-    radial = _smooth(_radial(*args, mask, CANDIDATES), args[4], args[8], mask)
-    velocity = across + along * torch.from_numpy(radial)[..., None]
-    args[1] = np.ascontiguousarray(velocity.numpy())
-    before, after, support = (torch.from_numpy(x) for x in _span(*args, mask, np.float32(last)))
-    return torch.where(valid[..., None], velocity, 0.0), before, after, support
+    arrays = [points.place, points.normal, points.pixel, own, frame, views.c2w[:, :3, 3], w2c, views.intrinsics, seen]
+    arrays = [np.ascontiguousarray(x.numpy(), np.float32) for x in arrays]
+    settings = np.array([TOLERANCE, DRIFT, LONGEST, FRONTAL, HANDOVER, STRAIGHT], np.float32)
+    order = np.argsort(arrays[4], kind="stable")
+    pieces, count, summary = _tracks(
+        points.view.numpy(), *arrays, field.numpy(), order, np.float32(-last), np.float32(last), settings, PIECES
+    )
+    taken = np.arange(PIECES)[None] < count[:, None]
+    owner = np.repeat(np.arange(len(count)), count)
+    return torch.from_numpy(pieces[taken]), torch.from_numpy(owner), torch.from_numpy(summary)
+
+
+def constraints(views: Views, points: Points) -> tuple[Tensor, Tensor, Tensor]:
+    """-> A (n,2,3) and b (n,2) for the motion to the next frame and to the previous one: A·motion = b, exact in
+    perspective."""
+    R = views.c2w[:, :3, :3][points.view]
+    A = R[:, :, :2].mT - points.ray[..., None] * R[:, None, :, 2]
+    size = points.depth[:, None] / views.intrinsics[points.view, :2]
+    return A, points.to_next * size, points.to_previous * size
+
+
+def scene_flow(views: Views, points: Points, A: Tensor, next_b: Tensor, previous_b: Tensor, intervals: int) -> Tensor:
+    """-> (intervals, G, G, G, 3) motion from each frame of the clip to its next, on voxels over
+    [-EXTENT, EXTENT]³ (indices x, y, z)."""
+    frame = ((views.time + 1) / views.frame_step).round().long()[points.view]
+    cell = ((points.place / EXTENT + 1) * (0.5 * GRID)).long().clamp(0, GRID - 1)
+    cell = (cell[:, 0] * GRID + cell[:, 1]) * GRID + cell[:, 2]
+    i, j = torch.triu_indices(3, 3)
+    normal_matrix = (A.mT @ A)[:, i, j]
+    sums = torch.zeros(intervals * GRID**3, 9)
+    for interval, b in ((frame, next_b), (frame - 1, -previous_b)):
+        inside = (interval >= 0) & (interval < intervals)
+        row = torch.cat([normal_matrix, (A * b[..., None]).sum(1)], -1)
+        sums.index_add_(0, (interval * GRID**3 + cell)[inside], row[inside])
+    sums = sums.reshape(intervals, GRID, GRID, GRID, 9)
+    near = sums.clone()
+    for away, weight in enumerate(BEYOND, 1):
+        if away < intervals:
+            near[away:] += weight * sums[:-away]
+            near[:-away] += weight * sums[away:]
+    quarter = GRID // 4
+    coarse = near.reshape(intervals, quarter, 4, quarter, 4, quarter, 4, 9).sum((2, 4, 6)) / 64
+    whole = coarse.mean((1, 2, 3), keepdim=True)
+    coarse = COARSE * _spread(coarse) + COARSEST * whole
+    total = _spread(near).reshape(intervals, quarter, 4, quarter, 4, quarter, 4, 9)
+    total += coarse[:, :, None, :, None, :, None]
+    return torch.from_numpy(_solve(total.reshape(-1, 9).numpy())).reshape(intervals, GRID, GRID, GRID, 3)
+
+
+def _spread(x: Tensor) -> Tensor:
+    """Blurs (T,G,G,G,C) by the triangle 1 2 3 2 1 along each of the three axes, zero outside; in place."""
+    for axis in (1, 2, 3):
+        n = x.shape[axis]
+        for _ in range(2):
+            y = x.clone()
+            x.narrow(axis, 1, n - 1).add_(y.narrow(axis, 0, n - 1))
+            x.narrow(axis, 0, n - 1).add_(y.narrow(axis, 1, n - 1))
+        x /= 9
+    return x
+
+
+@numba.njit(cache=True, parallel=True, fastmath=True)
+def _solve(rows):
+    """(n,9) upper triangles and right-hand sides of 3x3 normal equations -> (n,3), by Cramer's rule. A small
+    multiple of the trace keeps the component that nothing constrains at zero."""
+    n = len(rows)
+    out = np.zeros((n, 3), np.float32)
+    for k in numba.prange(n):
+        a, b, c, d, e, f = rows[k, 0], rows[k, 1], rows[k, 2], rows[k, 3], rows[k, 4], rows[k, 5]
+        trace = a + d + f
+        if trace < 1e-12:
+            continue
+        scale = 1 / trace
+        a, b, c, d, e, f = a * scale + 1e-3, b * scale, c * scale, d * scale + 1e-3, e * scale, f * scale + 1e-3
+        p, q, r = rows[k, 6] * scale, rows[k, 7] * scale, rows[k, 8] * scale
+        A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+        inverse = 1 / (a * A + b * B + c * C)
+        out[k, 0] = (A * p + B * q + C * r) * inverse
+        out[k, 1] = (B * p + (a * f - c * c) * q + (b * c - a * e) * r) * inverse
+        out[k, 2] = (C * p + (b * c - a * e) * q + (a * d - b * b) * r) * inverse
+    return out
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
-def _compare(p, j, frame, w2c, K, seen, tol):
-    """Where view j has point p (3): (depth error / tol, 1) on a surface or free space (-inf), or (0, 0) where
-    it is outside of the image or unknown."""
-    z = w2c[j, 2, 0] * p[0] + w2c[j, 2, 1] * p[1] + w2c[j, 2, 2] * p[2] + w2c[j, 2, 3]
-    if z < 0.01:
+def _compare(x, y, z, j, w2c, K, seen, tol):
+    """How view j sees a point: (depth error / tol, True), -inf in free space; (0, False) where it is outside
+    of the image or unknown."""
+    depth = w2c[j, 2, 0] * x + w2c[j, 2, 1] * y + w2c[j, 2, 2] * z + w2c[j, 2, 3]
+    if depth < 0.01:
         return 0.0, False
-    x = w2c[j, 0, 0] * p[0] + w2c[j, 0, 1] * p[1] + w2c[j, 0, 2] * p[2] + w2c[j, 0, 3]
-    y = w2c[j, 1, 0] * p[0] + w2c[j, 1, 1] * p[1] + w2c[j, 1, 2] * p[2] + w2c[j, 1, 3]
-    u = int(np.floor(x / z * K[j, 0] + K[j, 2]))
-    v = int(np.floor(y / z * K[j, 1] + K[j, 3]))
-    if u < 0 or v < 0 or u >= seen.shape[2] or v >= seen.shape[1]:
+    right = w2c[j, 0, 0] * x + w2c[j, 0, 1] * y + w2c[j, 0, 2] * z + w2c[j, 0, 3]
+    down = w2c[j, 1, 0] * x + w2c[j, 1, 1] * y + w2c[j, 1, 2] * z + w2c[j, 1, 3]
+    u = int(np.floor(right / depth * K[j, 0] + K[j, 2]))
+    v = int(np.floor(down / depth * K[j, 1] + K[j, 3]))
+    if u < 0 or v < 0 or u >= seen.shape[2] or v >= seen.shape[1] or seen[j, v, u] < 0:
         return 0.0, False
-    d = seen[j, v, u]
-    if d < 0:
-        return 0.0, False
-    return (z - d) / tol, True
+    return (depth - seen[j, v, u]) / tol, True
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _flow_at(field, interval, p, out):
+    """Trilinear value of the scene flow at p (3)."""
+    grid = field.shape[1]
+    base = np.empty(3, np.int64)
+    part = np.empty(3, np.float32)
+    for k in range(3):
+        g = min(max((p[k] / EXTENT + 1) * 0.5 * grid - 0.5, 0.0), grid - 1.001)
+        base[k] = int(g)
+        part[k] = g - base[k]
+        out[k] = 0
+    for corner in range(8):
+        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
+        w = (part[0] if a else 1 - part[0]) * (part[1] if b else 1 - part[1]) * (part[2] if c else 1 - part[2])
+        for k in range(3):
+            out[k] += w * field[interval, base[0] + a, base[1] + b, base[2] + c, k]
 
 
 @numba.njit(cache=True, parallel=True, fastmath=True)
-def _radial(world, across, along, normal, pixel, frame, w2c, K, seen, valid, candidates):
-    V, H, W = pixel.shape
-    out = np.zeros((V, H, W), np.float32)
-    for row in numba.prange(V * H):
-        i, v = row // H, row % H
-        p = np.empty(3, np.float32)
-        for u in range(W):
-            if not valid[i, v, u]:
-                continue
-            best, choice = -1e9, np.float32(0)
-            for candidate in candidates:
-                r = candidate * pixel[i, v, u]
-                score = -PRIOR * abs(candidate)
-                for j in range(V):
-                    dt = frame[j] - frame[i]
-                    if abs(dt) > WINDOW or abs(dt) < 0.5:
+def _tracks(view, world, normal, pixel, own, frame, eye, w2c, K, seen, field, order, start, last, settings, most):
+    tolerance, drift, longest, frontal, handover, straight = settings
+    n, steps = len(view), int(longest)
+    pieces = np.zeros((n, most, 8), np.float32)
+    count = np.zeros(n, np.int64)
+    summary = np.zeros((n, 4), np.float32)
+    views = len(frame)
+    for i in numba.prange(n):
+        path = np.zeros((2 * steps + 1, 3), np.float32)  # places at own frame - steps … + steps
+        p, flow = np.empty(3, np.float32), np.empty(3, np.float32)
+        reach = np.zeros(2, np.float32)
+        here = frame[view[i]]
+        path[steps] = world[i]
+        for side in range(2):
+            direction = 2 * side - 1
+            p[:] = world[i]
+            reached, needed = 0, np.float32(-1)
+            for s in range(1, steps + 1):
+                now = here + direction * s
+                if now < start - 0.25 or now > last + 0.25:
+                    needed = reached + 0.6  # to the clip's very end, at full strength
+                    break
+                interval = round((now if direction < 0 else now - 1) - start)
+                interval = min(max(interval, 0), len(field) - 1)
+                _flow_at(field, interval, p, flow)
+                for k in range(3):
+                    flow[k] *= direction
+                if s == 1:  # the pixel's own motion vector is exact: two of three components are known
+                    _agree(own[i, 1 - side], flow)
+                for k in range(3):
+                    p[k] += flow[k]
+                taken = gone = False
+                for m in range(views):
+                    j = order[m]
+                    if abs(frame[j] - now) > 0.25:
                         continue
-                    for k in range(3):
-                        p[k] = world[i, v, u, k] + dt * (across[i, v, u, k] + r * along[i, v, u, k])
-                    tol = (TOLERANCE + DRIFT * abs(dt)) * pixel[i, v, u]
-                    error, known = _compare(p, j, frame, w2c, K, seen, tol)
+                    tol = (tolerance + drift * s) * pixel[i]
+                    error, known = _compare(p[0], p[1], p[2], j, w2c, K, seen, tol)
                     if not known:
                         continue
-                    weight = np.exp(-abs(dt) / 2)
-                    if abs(error) < 2.5:
-                        score += weight * np.exp(-0.5 * error * error)
                     if error < -1:
-                        score -= weight * min(1.0, -error - 1)
-                if score > best:
-                    best, choice = score, r
-            out[i, v, u] = choice
-    return out
+                        gone = True
+                    elif error <= 1:
+                        summary[i, 2] += 1
+                        cosine, square = np.float32(0), np.float32(1e-9)
+                        for k in range(3):
+                            cosine += normal[i, k] * (eye[j, k] - p[k])
+                            square += (eye[j, k] - p[k]) ** 2
+                        taken |= cosine > frontal * np.sqrt(square)
+                if gone:
+                    needed = reached + 0.3
+                    summary[i, 3] = 1
+                    break
+                path[steps + direction * s] = p
+                reached = s
+                if taken:
+                    needed = handover * s
+                    break
+            if needed < 0:
+                needed = reached + 0.3
+            for s in range(reached + 1, steps + 1):  # beyond the last known place: straight on
+                for k in range(3):
+                    a, b = steps + direction * (s - 1), steps + direction * max(s - 2, 0)
+                    path[steps + direction * s, k] = path[a, k] + (path[a, k] - path[b, k])
+            reach[side] = max(needed, 0.3)
+            summary[i, side] = needed
+        count[i] = _cut(path, steps, here, -reach[0], reach[1], straight * pixel[i], most, pieces[i])
+    return pieces, count, summary
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _smooth(radial, pixel, seen, valid):
-    """Mean over the 5x5 neighbours on the same surface: single pixels choose noisily, parts move together."""
-    V, H, W = radial.shape
-    out = np.zeros_like(radial)
-    for row in numba.prange(V * H):
-        i, v = row // H, row % H
-        for u in range(W):
-            if not valid[i, v, u]:
-                continue
-            total, count = 0.0, 0
-            for y in range(max(v - 2, 0), min(v + 3, H)):
-                for x in range(max(u - 2, 0), min(u + 3, W)):
-                    if valid[i, y, x] and abs(seen[i, y, x] - seen[i, v, u]) < 4 * pixel[i, v, u]:
-                        total += radial[i, y, x]
-                        count += 1
-            out[i, v, u] = total / count
-    return out
+@numba.njit(cache=True, fastmath=True)
+def _agree(own, flow):
+    """Moves flow (3) by the least amount such that A·flow = b holds, own = A (2x3 row by row), b (2)."""
+    aa = own[0] ** 2 + own[1] ** 2 + own[2] ** 2
+    ab = own[0] * own[3] + own[1] * own[4] + own[2] * own[5]
+    bb = own[3] ** 2 + own[4] ** 2 + own[5] ** 2
+    r = own[6] - (own[0] * flow[0] + own[1] * flow[1] + own[2] * flow[2])
+    s = own[7] - (own[3] * flow[0] + own[4] * flow[1] + own[5] * flow[2])
+    d = 1 / (aa * bb - ab * ab)
+    x, y = (bb * r - ab * s) * d, (aa * s - ab * r) * d
+    for k in range(3):
+        flow[k] += x * own[k] + y * own[3 + k]
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _span(world, velocity, along, normal, pixel, frame, w2c, K, seen, valid, last):
-    V, H, W = pixel.shape
-    before = np.zeros((V, H, W), np.float32)
-    after = np.zeros((V, H, W), np.float32)
-    support = np.zeros((V, H, W), np.float32)
-    order = np.argsort(frame)
-    for row in numba.prange(V * H):
-        i, v = row // H, row % H
-        p = np.empty(3, np.float32)
-        for u in range(W):
-            if not valid[i, v, u]:
-                continue
-            for direction in (-1, 1):
-                span = min(MAX_SPAN, (last - direction * frame[i]) + 1.0)
-                reached = 0.0  # frames up to which nothing contradicts the point
-                for n in range(V):
-                    j = order[n] if direction > 0 else order[V - 1 - n]
-                    dt = frame[j] - frame[i]
-                    if direction * dt < 0.5:
-                        continue
-                    if abs(dt) > MAX_SPAN:
-                        break
-                    cosine = 0.0
-                    distance = 1e-9
-                    for k in range(3):
-                        p[k] = world[i, v, u, k] + dt * velocity[i, v, u, k]
-                        eye = -(w2c[j, 0, k] * w2c[j, 0, 3] + w2c[j, 1, k] * w2c[j, 1, 3] + w2c[j, 2, k] * w2c[j, 2, 3])
-                        cosine += normal[i, v, u, k] * (eye - p[k])
-                        distance += (eye - p[k]) ** 2
-                    cosine /= np.sqrt(distance)
-                    tol = (TOLERANCE + DRIFT * abs(dt)) * pixel[i, v, u]
-                    error, known = _compare(p, j, frame, w2c, K, seen, tol)
-                    if known and error < -1:
-                        span = 0.5 * (reached + abs(dt))
-                        break
-                    reached = abs(dt)
-                    if known and abs(error) <= 1:
-                        support[i, v, u] += 1
-                        if cosine > FRONTAL:
-                            span = 0.5 * abs(dt)
-                            break
-                if direction < 0:
-                    before[i, v, u] = span
-                else:
-                    after[i, v, u] = span
-    return before, after, support
+@numba.njit(cache=True, fastmath=True)
+def _at(path, steps, s, out):
+    """Place on the path s frames from its middle."""
+    low = int(np.floor(s))
+    low = min(max(low, -steps), steps - 1)
+    for k in range(3):
+        out[k] = path[steps + low, k] + (s - low) * (path[steps + low + 1, k] - path[steps + low, k])
+
+
+@numba.njit(cache=True, fastmath=True)
+def _cut(path, steps, here, first, end, straight, most, out):
+    """Cuts first…end (frames from the path's middle) into pieces that stay within `straight` of their chords,
+    each as long as it can be; writes them to out (most,8) and returns how many."""
+    a, b, m = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    n = 0
+    begin = first
+    while n < most and begin < end - 1e-3:
+        stop = end
+        while n < most - 1:
+            _at(path, steps, begin, a)
+            _at(path, steps, stop, b)
+            worst = np.float32(0)
+            for s in range(int(np.ceil(begin)), int(np.floor(stop)) + 1):
+                w = (s - begin) / (stop - begin)
+                square = np.float32(0)
+                for k in range(3):
+                    square += (path[steps + s, k] - a[k] - w * (b[k] - a[k])) ** 2
+                worst = max(worst, square)
+            shorter = np.float32(np.ceil(stop) - 1)
+            if worst <= straight * straight or shorter <= begin + 0.5:
+                break
+            stop = shorter
+        _at(path, steps, begin, a)
+        _at(path, steps, stop, b)
+        _at(path, steps, 0.5 * (begin + stop), m)
+        out[n, 0] = here + 0.5 * (begin + stop)
+        out[n, 1] = 0.5 * (stop - begin)
+        for k in range(3):
+            out[n, 2 + k] = 0.25 * (a[k] + b[k]) + 0.5 * m[k]
+            out[n, 5 + k] = (b[k] - a[k]) / (stop - begin)
+        n += 1
+        begin = stop
+    return n

@@ -15,94 +15,84 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .follow import follow
+from .follow import Points, follow
 from .gaussians import Gaussians4D, quaternion
 from .views import Views, camera_rays
 
-FOOTPRINT = 0.45  # σ of a Gaussian in pixels of the view that made it
+FOOTPRINT = 0.25  # σ of a Gaussian in pixels of the view that made it
 STRETCH = 4.0  # a slanted pixel's footprint grows at most by this
 THICKNESS = 0.15  # σ along the normal, in pixels
+INSET = 1.0  # how far below the surface a Gaussian sits, in pixels: its own width reaches back out to it
 OPACITY = 0.95
-HANDOVER = 1.3  # σ_t as a multiple of half the span in which a Gaussian is needed
-FEATURES = 11  # extra input channels that a Geometry carries
+LIFE = 0.5  # σ_t as a multiple of half a piece's length
+SHORTEST = 0.45  # least σ_t, in frames: less would flicker between frames
+FEATURES = 12  # extra input channels that a Geometry carries
 
 
 @dataclass
 class Geometry:
-    """What is known of each pixel of V views before the network: a Gaussian, and how far to trust it."""
+    """What is known of the pixels of V views before the network."""
 
-    gaussians: Gaussians4D  # fields (V,H,W,…); meaningless where not `valid`
-    valid: Tensor  # (V,H,W) bool
+    gaussians: Gaussians4D  # (M,) one or several per valid pixel: the pieces of its point's track
+    owner: Tensor  # (M,) the pixel that each belongs to, as an index into (V·H·W), ascending
     slack: Tensor  # (V,H,W) how far along its ray the network may move it, normalised units
     features: Tensor  # (V,H,W,FEATURES) extra input channels, zero where not valid
 
 
 def lift(views: Views) -> Gaussians4D:
-    """Views with depth and flow -> (N,) Gaussians, one per foreground pixel with depth."""
-    geometry = lift_geometry(views)
-    return geometry.gaussians[geometry.valid]
+    """Views with depth and flow -> (M,) Gaussians."""
+    return lift_geometry(views).gaussians
 
 
 def lift_geometry(views: Views) -> Geometry:
     """Views with depth and flow -> Geometry. CPU tensors (the kernel that follows points is compiled)."""
+    step = views.frame_step
     depth = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
     valid = (views.alpha > 0.35) & (depth > 0)
-    focal = views.intrinsics[:, None, None, :2]
-    motion = central_flow(views) * depth[..., None] / focal
-    slack = 2 * depth / views.intrinsics[:, 0, None, None]
-    return geometry_from_depth(views, depth, valid, motion, slack)
-
-
-def geometry_from_depth(views: Views, depth: Tensor, valid: Tensor, motion: Tensor, slack: Tensor) -> Geometry:
-    """depth (V,H,W) planar z, valid (V,H,W), motion (V,H,W,2) of the surface across the view per frame in
-    normalised units and camera axes, slack (V,H,W) uncertainty of the depth -> Geometry."""
-    step = views.frame_step
-    R = views.c2w[:, :3, :3]
     ray = camera_rays(views.intrinsics, *views.size)
     pixel = depth / views.intrinsics[:, 0, None, None]  # a pixel's size at the surface
     point = ray * depth[..., None]
-    scale, frame_axes = tangent_frame(
-        surface_slope(point, valid, pixel, axis=2), surface_slope(point, valid, pixel, axis=1), point, pixel
-    )
+    slopes = [surface_slope(point, valid, pixel, axis)[valid] for axis in (2, 1)]
 
-    def to_world(x: Tensor) -> Tensor:
-        return torch.einsum("vij,vhwj->vhwi", R, x)
+    view = valid.nonzero()[:, 0]
+    R, ray, depth, pixel, point = views.c2w[view, :3, :3], ray[valid], depth[valid], pixel[valid], point[valid]
+    scale, axes = tangent_frame(*slopes, point, pixel)
+    axes = R @ axes
+    place = (R @ point[..., None])[..., 0] + views.c2w[view, :3, 3]
+    flow, alpha = views.flow[valid], views.alpha[valid]
+    points = Points(view, place, axes[..., 2], pixel, flow[:, :2], flow[:, 2:], depth, ray[:, :2])
+    # Pixels that mix object and background say nothing about depth.
+    seen = torch.where(views.alpha < 0.02, torch.inf, -1.0)
+    seen[valid] = depth
+    pieces, owner, summary = follow(views, points, seen)
 
-    world = to_world(point) + views.c2w[:, None, None, :3, 3]
-    normal = to_world(frame_axes[..., 2])
-    across = to_world(torch.cat([motion, torch.zeros_like(motion[..., :1])], -1))
-    velocity, before, after, support = follow(views, world, across, to_world(ray), normal, pixel, valid, depth)
-
-    middle = 0.5 * (after - before)  # frames from the view's own time to the middle of the span it is needed
-    half_span = (0.5 * (after + before)).clamp_min(0.4)
+    middle, half, place, velocity = pieces[:, 0], pieces[:, 1], pieces[:, 2:5], pieces[:, 5:8]
     gaussians = Gaussians4D(
-        xyz=world + velocity * middle[..., None],
-        t=views.time[:, None, None] + middle * step,
+        xyz=place - INSET * (pixel[:, None] * points.normal)[owner],
+        t=middle * step,
         velocity=velocity / step,
-        sigma_t=HANDOVER * half_span * step,
-        scale=scale,
-        rotation=quaternion(R[:, None, None] @ frame_axes),
-        rgb=views.rgb,
-        opacity=(OPACITY * views.alpha).clamp(1e-3, 0.99),
+        sigma_t=(LIFE * half).clamp_min(SHORTEST) * step,
+        scale=scale[owner],
+        rotation=quaternion(axes)[owner],
+        rgb=views.rgb[valid][owner],
+        opacity=(OPACITY * alpha).clamp(1e-3, 0.99)[owner],
     )
-    features = [
-        (depth * ray.norm(dim=-1) / 2.7 - 1)[..., None],
-        normal,
-        0.3 * velocity / step,
-        0.25 * torch.stack([before, after, support], -1),
-        views.alpha[..., None],
-    ]
-    features = torch.where(valid[..., None], torch.cat(features, -1), 0.0)
-    return Geometry(gaussians, valid, slack, features)
+    motion = primary(owner, middle - (views.time / step)[view[owner]], velocity, len(view))
+    known = [(depth * ray.norm(dim=-1))[:, None] / 2.7 - 1, points.normal, 0.3 * motion / step]
+    known += [summary * torch.tensor([0.25, 0.25, 0.25, 1.0]), alpha[:, None]]
+    features = torch.zeros(*views.alpha.shape, FEATURES)
+    features[valid] = torch.cat(known, -1)
+    slack = torch.zeros_like(views.alpha)
+    slack[valid] = 2 * pixel
+    return Geometry(gaussians, valid.flatten().nonzero()[:, 0][owner], slack, features)
 
 
-def central_flow(views: Views) -> Tensor:
-    """(V,H,W,2) motion in pixels per frame: the mean of forward and backward motion vectors; at the clip's
-    first and last frame the one that lies inside the clip."""
-    ahead, behind = views.flow[..., :2], -views.flow[..., 2:]
-    first = (views.time < -1 + 0.5 * views.frame_step)[:, None, None, None]
-    last = (views.time > 1 - 0.5 * views.frame_step)[:, None, None, None]
-    return torch.where(first, ahead, torch.where(last, behind, 0.5 * (ahead + behind)))
+def primary(owner: Tensor, away: Tensor, values: Tensor, n: int) -> Tensor:
+    """values (M,C) of pieces -> (n,C): of each of the n owners' pieces the one with the least |away| (M)."""
+    order = torch.argsort(away.abs(), descending=True, stable=True)
+    out = torch.zeros(n, values.shape[1])
+    out.numpy()[owner[order].numpy()] = values[order].numpy()  # of several writes to one place the last holds
+    return out
 
 
 def surface_slope(point: Tensor, valid: Tensor, pixel: Tensor, axis: int) -> Tensor:

@@ -99,7 +99,8 @@ class Network(nn.Module):
 
     def forward(self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True) -> Gaussians4D:
         """views: V images, height and width multiples of the patch; geometry: for the sources `sweep` and
-        `given`. Pixels in dropped patches, and pixels without valid geometry, yield no Gaussian."""
+        `given`. Pixels in dropped patches, and pixels that own no Gaussian of the
+        geometry, yield none."""
         c, p = self.config, self.config.patch
         height, width = views.size
         if height % p or width % p:
@@ -120,15 +121,16 @@ class Network(nn.Module):
         x = self.norm_out(x)
         g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.outputs))  # (T, p², outputs)
 
-        def pixels(m: Tensor) -> Tensor:
-            return gather_pixels(m, keep, p)
-
         if geometry is not None:
-            base = geometry.gaussians.map(pixels)
-            out = self.residual(g, base, pixels(direction), pixels(geometry.slack))
-            out = out[pixels(geometry.valid)]
+            row = self.rows(views, keep)[geometry.owner]  # (M,) which of the outputs is about which Gaussian
+
+            def mine(m: Tensor) -> Tensor:
+                return m.reshape(-1, *m.shape[3:])[geometry.owner]
+
+            out = self.residual(g.flatten(0, 1)[row], geometry.gaussians, mine(direction), mine(geometry.slack))
         else:
-            out = self.pixel_aligned(g, pixels(origin), pixels(direction)).map(lambda m: m.flatten(0, 1))
+            pixels = (gather_pixels(m, keep, p) for m in (origin, direction))
+            out = self.pixel_aligned(g, *pixels).map(lambda m: m.flatten(0, 1))
         if c.free:
             free = self.activate(self.decode_free(x[tokens:]).float())
             out = Gaussians4D.cat([out, free])
@@ -138,6 +140,15 @@ class Network(nn.Module):
         """(P,) bool: the patches that become tokens; with `drop_empty` those that show any foreground."""
         seen = patchify(views.alpha[..., None], self.config.patch).amax((1, 2)) > 0
         return seen if drop_empty else torch.ones_like(seen)
+
+    def rows(self, views: Views, keep: Tensor) -> Tensor:
+        """(V·H·W,) for every pixel its place among the outputs of the kept patches; -1 where dropped."""
+        height, width = views.size
+        number = torch.arange(len(views) * height * width, device=keep.device).reshape(len(views), height, width)
+        row = torch.full_like(number.flatten(), -1)
+        chosen = gather_pixels(number, keep, self.config.patch).flatten()
+        row[chosen] = torch.arange(len(chosen), device=keep.device)
+        return row
 
     def pixel_aligned(self, g: Tensor, origin: Tensor, direction: Tensor) -> Gaussians4D:
         """g (…,outputs), origin and direction (…,3) -> Gaussians on their pixels' rays (appendix A.1)."""
@@ -177,7 +188,7 @@ class Network(nn.Module):
         return Gaussians4D.from_covariance(xyz, t, velocity, sigma_t, cov3, rgb, opacity)
 
     def residual(self, g: Tensor, base: Gaussians4D, direction: Tensor, slack: Tensor) -> Gaussians4D:
-        """g (…,19), base Gaussians (…), their rays' directions (…,3), slack (…) -> base plus bounded steps:
+        """g (M,19), base Gaussians (M,), their rays' directions (M,3), slack (M,) -> base plus bounded steps:
         along the ray by `slack`, σ and σ_t by a factor of e^1.5, colour by 0.5, velocity by 4 per unit of
         time, μ_t by 0.3, opacity by 4 in its logit."""
         move = slack[..., None] * torch.tanh(g[..., :3].mean(-1, keepdim=True))

@@ -58,11 +58,12 @@ def sweep_geometry(views: Views) -> Geometry:
         rotation=quaternion((R[:, None, None] @ axes).expand(*depth.shape, 3, 3)),
         rgb=views.rgb,
         opacity=(OPACITY * views.alpha).clamp(1e-3, 0.99),
-    )
+    ).map(lambda x: x[valid])
     distance = depth * ray.norm(dim=-1)
     maps = [distance / 2.7 - 1, spread, certainty, views.alpha, 0.25 * span]
     features = torch.stack(maps + [torch.zeros_like(depth)] * (FEATURES - len(maps)), -1)
-    return Geometry(gaussians, valid, 0.1 + 2 * spread, torch.where(valid[..., None], features, 0.0))
+    owner = valid.flatten().nonzero()[:, 0]
+    return Geometry(gaussians, owner, 0.1 + 2 * spread, torch.where(valid[..., None], features, 0.0))
 
 
 def relief(views: Views) -> torch.Tensor:

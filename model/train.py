@@ -13,7 +13,6 @@ import math
 import os
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from .data import Clips, Sample
 from .gaussians import Gaussians4D
 from .lift import lift_geometry
 from .losses import geometric, photometric
-from .network import PRESETS, Network, gather_pixels
+from .network import PRESETS, Network
 from .rasterize import render
 from .reconstruct import geometry_for, load_network, save_network
 
@@ -33,28 +32,8 @@ EMA = 0.998  # per step; the shipped weights are this average
 CLIP = 1.0  # gradient norm; steps beyond 20 times that are skipped
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences rendered with passes")
-    p.add_argument("--out", type=Path, required=True, help="run folder; training goes on where it stands")
-    p.add_argument("--preset", choices=PRESETS, default="tiny", help="network size (default: tiny)")
-    p.add_argument("--head", choices=["paper", "kinematic"], default="kinematic", help="20 or 19 outputs a pixel")
-    p.add_argument("--source", choices=["given", "sweep", "predicted"], default="given", help="of the depth")
-    p.add_argument("--depth-range", choices=["paper", "centred"], default="paper", help="for --source predicted")
-    p.add_argument("--init", type=Path, help="checkpoint to start from, instead of random weights")
-    p.add_argument("--steps", type=int, default=100_000, help="stop after this many steps")
-    p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")
-    p.add_argument("--views", type=int, default=24, help="input views of a sample (default: 24)")
-    p.add_argument("--targets", type=int, default=8, help="supervision views of a sample (default: 8)")
-    p.add_argument("--rate", type=float, default=4e-4, help="peak learning rate (default: 4e-4)")
-    p.add_argument("--accumulate", type=int, default=1, help="samples per step (default: 1)")
-    p.add_argument("--geometric", type=float, default=0.0, help="weight of the geometric loss for RGB sources")
-    p.add_argument("--bf16", action="store_true", help="run the transformer in bfloat16")
-    p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
-    p.add_argument("--cache", type=Path, default=Path("data/cache"), help="where packed clips are kept")
-    p.add_argument("--seed", type=int, default=0)
-
-
 def run(args: argparse.Namespace) -> int:
+    """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
     clips = Clips(args.data, args.cache)
     config = replace(PRESETS[args.preset], head=args.head, source=args.source, depth_range=args.depth_range)
     torch.manual_seed(args.seed)
@@ -175,17 +154,20 @@ class Trainer:
         return loss, score, clock
 
     def pixel_truth(self, inputs, geometry, truth) -> tuple[torch.Tensor, Gaussians4D, torch.Tensor]:
-        """Time of the view, true Gaussian and whether it is known, for each of the network's Gaussians."""
-        p = self.network.config.patch
-        keep = self.network.kept_patches(inputs)
-        chosen = torch.ones_like(truth.valid) if geometry is None else geometry.valid
-        chosen = gather_pixels(chosen, keep, p)
-
-        def gather(m):
-            return gather_pixels(m, keep, p)[chosen]
-
-        time_map = inputs.time[:, None, None].expand_as(truth.slack)
-        return gather(time_map), truth.gaussians.map(gather), gather(truth.valid)
+        """For each of the network's Gaussians: the time of its view, what the lift of the renderer's depth says
+        of its pixel, and whether that is known."""
+        if geometry is not None:
+            owner = geometry.owner
+        else:
+            row = self.network.rows(inputs, self.network.kept_patches(inputs))
+            kept = (row >= 0).nonzero()[:, 0]
+            owner = kept[torch.argsort(row[kept])]
+        view_time = inputs.time[:, None, None].expand_as(inputs.alpha).flatten()
+        away = (truth.gaussians.t - view_time[truth.owner]).abs()
+        order = torch.argsort(away, descending=True, stable=True)
+        piece = torch.full((len(view_time),), -1)
+        piece.numpy()[truth.owner[order].numpy()] = order.numpy()  # of a pixel's pieces the one of its own time
+        return view_time[owner], truth.gaussians[piece[owner]], piece[owner] >= 0
 
     def save(self) -> None:
         state = {

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from timesplat.model import lift as lift_module
 from timesplat.model.evaluate import draw
+from timesplat.model.follow import EXTENT, GRID, Points, constraints, scene_flow
 from timesplat.model.lift import lift, lift_geometry, tangent_frame
 from timesplat.model.metrics import psnr
+from timesplat.model.views import rays
 
 FRAMES = list(range(24))
 
@@ -16,28 +19,60 @@ def views(spheres):
     return spheres(FRAMES)
 
 
-def test_places_are_on_the_surface_at_the_views_own_time(spheres, views):
-    geometry = lift_geometry(views)
-    g = geometry.gaussians
-    here = g.position(views.time[:, None, None])[geometry.valid]
-    z = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
-    from timesplat.model.views import rays
+def own_piece(geometry, views):
+    """For each pixel with Gaussians: the one of its own time -> pixel index, Gaussians."""
+    view_time = views.time[:, None, None].expand_as(views.alpha).flatten()[geometry.owner]
+    away = (geometry.gaussians.t - view_time).abs()
+    best = {}
+    for k, (pixel, a) in enumerate(zip(geometry.owner.tolist(), away.tolist(), strict=True)):
+        if pixel not in best or a < best[pixel][0]:
+            best[pixel] = (a, k)
+    pixels = torch.tensor(list(best))
+    return pixels, geometry.gaussians[torch.tensor([k for _, k in best.values()])]
 
+
+def test_places_at_the_views_own_time_are_on_the_surface(views, monkeypatch):
+    monkeypatch.setattr(lift_module, "INSET", 0.0)
+    pixels, g = own_piece(lift_geometry(views), views)
+    here = g.position(views.time[:, None, None].expand_as(views.alpha).flatten()[pixels])
     origin, direction = rays(views.c2w, views.intrinsics, *views.size)
     forward = views.c2w[:, None, None, :3, 2]
+    z = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
     truth = origin + direction * (z / (direction * forward).sum(-1))[..., None]
-    torch.testing.assert_close(here, truth[geometry.valid], atol=1e-4, rtol=0)
+    error = (here - truth.reshape(-1, 3)[pixels]).norm(dim=-1)
+    assert len(pixels) == int(torch.isfinite(views.depth).sum())
+    assert error.max() < 0.06 and error.median() < 0.005  # a pixel is 0.054 here; pieces may be half of it off
 
 
 def test_velocities_match_the_true_motion_in_all_three_directions(spheres, views):
-    """Motion vectors give two of the three components; the third is found by agreement between views."""
-    geometry = lift_geometry(views)
-    g, valid = geometry.gaussians, geometry.valid
-    at = g.position(views.time[:, None, None])[valid].numpy()
-    frame = np.repeat(FRAMES, valid.flatten(1).sum(1).numpy())
-    error = np.linalg.norm(g.velocity[valid].numpy() * views.frame_step - spheres.truth(at, frame), axis=-1)
-    assert np.median(error) < 0.0055  # a tenth of a pixel (0.054) a frame at this size; speeds: 0.022 to 0.025
+    """Motion vectors give two of the three components; views from other sides give the third."""
+    pixels, g = own_piece(lift_geometry(views), views)
+    frame = pixels.numpy() // (48 * 48)
+    at = g.position(views.time[pixels // (48 * 48)]).numpy()
+    error = np.linalg.norm(g.velocity.numpy() * views.frame_step - spheres.truth(at, frame), axis=-1)
+    assert np.median(error) < 0.004  # speeds are 0.022 to 0.025 a frame
     assert np.percentile(error, 90) < 0.02
+
+
+def test_scene_flow_is_exact_where_two_sides_see_one_motion(spheres):
+    """Two perpendicular views of one rigid translation: the least squares have one answer."""
+    views = spheres([5, 5], [(0, 0), (90, 0)])
+    torch.manual_seed(0)
+    n, motion = 200, torch.tensor([0.02, -0.01, 0.03])
+    place, view = torch.rand(n, 3) * 0.05 + 0.2, torch.arange(n) % 2
+    w2c = torch.linalg.inv(views.c2w)[view]
+
+    def project(p):
+        local = (w2c[:, :3, :3] @ p[..., None])[..., 0] + w2c[:, :3, 3]
+        return local[:, :2] / local[:, 2:], local[:, 2]
+
+    ray, depth = project(place)
+    f = views.intrinsics[0, 0]
+    to_next, to_previous = ((project(place + k * motion)[0] - ray) * f for k in (1, -1))
+    points = Points(view, place, place, depth / f, to_next, to_previous, depth, ray)
+    field = scene_flow(views, points, *constraints(views, points), 23)
+    cell = ((place.mean(0) / EXTENT + 1) * GRID / 2).long()
+    torch.testing.assert_close(field[5][tuple(cell)], motion, atol=5e-4, rtol=0)
 
 
 def test_a_side_seen_often_lives_shorter(spheres):
@@ -76,4 +111,4 @@ def test_a_lone_pixel_and_an_empty_view_are_finite(spheres):
     keep[0, row, column] = 1
     views.alpha = keep
     g = lift(views)
-    assert len(g) == 1 and all(torch.isfinite(getattr(g, k)).all() for k in ("xyz", "scale", "rotation", "sigma_t"))
+    assert len(g) >= 1 and all(torch.isfinite(getattr(g, k)).all() for k in ("xyz", "scale", "rotation", "sigma_t"))
