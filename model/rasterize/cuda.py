@@ -33,8 +33,9 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
             keep &= (marginal >= FILTER) & (o >= FILTER)
         keep = keep.nonzero()[:, 0]
         if not len(keep):
-            images.append(background.float().expand(height, width, 3))
-            alphas.append(torch.zeros(height, width, device=xyz.device))
+            nothing = 0 * rgb[keep].sum()  # zero, but part of the graph
+            images.append((background + nothing).float().expand(height, width, 3))
+            alphas.append(nothing.float().expand(height, width))
             continue
         image, alpha, _ = rasterization(
             means=(xyz[keep] + velocity[keep] * dt[keep, None]).float(),
