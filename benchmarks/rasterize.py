@@ -49,7 +49,7 @@ def scene(n, size, views, seed=0):
 def footprint(g, view):
     """Pairs (visible Gaussian, view), and steps of eight pixels if every row of a footprint were one span."""
     xyz, t, velocity, sigma_t, cov, _, opacity = (x.detach() for x in g)
-    c2w, K, times, size, _ = view
+    c2w, K, times = view[:3]
     pairs = steps = 0
     for i in range(len(times)):
         dt = times[i] - t

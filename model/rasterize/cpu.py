@@ -267,13 +267,18 @@ def _bands(width, height):
     return [(k * across, k * across + across) for k in range(down)]
 
 
+def _arrays(tensors, dtype=torch.float32):
+    return tuple(x.detach().to(dtype).contiguous().numpy() for x in tensors)
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, *args):
         cameras, (size, background, inference) = args[7:10], args[10:]
-        inputs = tuple(x.detach().float().contiguous().numpy() for x in args[:7])
-        cameras = tuple(x.detach().double().contiguous().numpy() for x in cameras)
-        background = background.float().contiguous().numpy()
+        ctx.save_for_backward(*args[:7])  # so that torch notices if they are changed in place before backward
+        inputs = _arrays(args[:7])
+        cameras = _arrays(cameras, torch.float64)
+        (background,) = _arrays([background])
         (width, height), views = size, len(cameras[0])
         shape = (views, height, width)
         image, alpha, left, index = (np.empty(s, np.float32) for s in ((*shape, 3), shape, shape, shape))
@@ -286,14 +291,14 @@ class _Rasterize(torch.autograd.Function):
             _blend_tiles(band, *rows[c][1:], background, image[c], alpha[c], left[c], index[c])
 
         _each(itertools.product(range(views), _bands(width, height)), blend)
-        ctx.saved = inputs, cameras, background, rows, left, index, args[0].dtype
+        ctx.saved = cameras, background, rows, left, index
         return torch.from_numpy(image).to(args[0].dtype), torch.from_numpy(alpha).to(args[0].dtype)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *grads):
-        inputs, cameras, background, rows, left, index, dtype = ctx.saved
-        g_image, g_alpha = (g.float().contiguous().numpy() for g in grads)
+        inputs, (cameras, background, rows, left, index) = _arrays(ctx.saved_tensors), ctx.saved
+        g_image, g_alpha = _arrays(grads)
         views, height, width = left.shape
         used = [np.zeros(len(starts) - 1, np.int64) for _, _, starts, _ in rows]
         sums = [np.empty((len(pairs), SUMS), np.float32) for _, _, _, pairs in rows]
@@ -315,7 +320,7 @@ class _Rasterize(torch.autograd.Function):
                 project.chain(c, own, rows[c][0], rows[c][1], added[c], *inputs, *cameras, width, height, out)
 
         _each([(k,) for k in range(parts)], chain)
-        return *(torch.from_numpy(x).to(dtype) for x in out), *([None] * 6)
+        return *(torch.from_numpy(x).to(y.dtype) for x, y in zip(out, ctx.saved_tensors, strict=True)), *([None] * 6)
 
 
 def rasterize(*args):
