@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+
 from timesplat.datagen.sequence import InputError
 from timesplat.model.asset import ARRAYS, SH_C0, Asset, Clip, check, read_ply, write_ply
 
@@ -248,9 +249,7 @@ def test_check_names_the_array(name, tmp_path):
     assert not os.listdir(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("scale", 0), ("sigma_t", -1), ("opacity", 1.1), ("rotation", 3)]
-)
+@pytest.mark.parametrize(("name", "value"), [("scale", 0), ("sigma_t", -1), ("opacity", 1.1), ("rotation", 3)])
 def test_check_knows_the_ranges(name, value):
     a = make(5)
     getattr(a, name).flat[0] = value

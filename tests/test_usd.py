@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("pxr")
 from pxr import Sdf, Usd, UsdGeom, Vt
+
 from timesplat.datagen.sequence import InputError
 from timesplat.model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, linear_from_srgb
 from timesplat.model.usd import BOX, PRIM, SPLAT, check_usd, read_usd, write_usd

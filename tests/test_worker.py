@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+
 from timesplat.datagen.sequence import Passes, Sequence, View, focal_from_fov, opengl_to_opencv, write_passes
 from timesplat.datagen.sequence import write_sequence as write
 from timesplat.model.asset import read_ply
@@ -23,6 +24,7 @@ def ask(*argv, stdin="", code=None):
 def sequence(tmp_path_factory):
     """A sphere of radius 0.6 that stands still, seen by four cameras at four frames."""
     from PIL import Image
+
     from timesplat.datagen.rigs import alternating
 
     size = 32
