@@ -112,7 +112,8 @@ def _point_cloud(xyz: np.ndarray, name: str, context):
 
 
 def _attributes(cloud, asset: Asset) -> None:
-    scale = np.maximum(asset.scale, THINNEST * asset.scale.max(1, keepdims=True))
+    soft = asset.soft_scale()  # Cycles does not blur by a share of a pixel as splat rasterisers do
+    scale = np.maximum(soft, THINNEST * soft.max(1, keepdims=True))
     rows = (rotation_matrices(asset.rotation) / scale[:, None, :]).transpose(0, 2, 1)  # (RS)⁻¹ = S⁻¹ Rᵀ
     color = np.concatenate([linear_from_srgb(asset.rgb), np.ones((len(asset), 1), np.float32)], 1)
     for name, kind, key, values in (
@@ -123,7 +124,7 @@ def _attributes(cloud, asset: Asset) -> None:
         ("gs_scale", "FLOAT_VECTOR", "vector", asset.scale),
         ("gs_rotation", "QUATERNION", "value", asset.rotation),
         ("gs_color", "FLOAT_COLOR", "color", color),
-        ("gs_radius", "FLOAT", "value", np.sort(asset.scale, 1)[:, 1]),  # covers a flat splat's face
+        ("gs_radius", "FLOAT", "value", np.sort(soft, 1)[:, 1]),  # covers a flat splat's face
         ("gs_reach", "FLOAT", "value", REACH * scale.max(1)),
         *((f"gs_row_{i}", "FLOAT_VECTOR", "vector", rows[:, i]) for i in range(3)),
     ):

@@ -13,16 +13,17 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from ..datagen.sequence import InputError
+from ..datagen.sequence import InputError, Sequence
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C0 * f_dc
 VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment (the paper's filter)
 STATIC_SIGMA_T = 1e4  # lifetime of what does not change: exp(-½(2/1e4)²) is 1 in float32
+BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
 OPACITY_EPS = 1e-6  # opacities are kept this far from 0 and 1 in a .ply, where they are logits
 
 VERSION = 1
@@ -46,6 +47,7 @@ class Clip:
     frame_end: int = 23  # inclusive; model time -1 is frame_start, +1 is frame_end
     scale: float = 1.0  # world = scale * normalised + translation
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pixel: float = 0.0  # size at the object of a pixel of the pictures it was made from; 0 = not known
 
     def frame_to_time(self, frame):
         """Model time of a (fractional) frame number or array of them; 0 where the clip is one frame."""
@@ -88,6 +90,16 @@ class Asset:
         """Model time of a (fractional) frame number of the clip: frame_start is -1, frame_end is +1."""
         return self.clip.frame_to_time(frame)
 
+    def soft_scale(self) -> np.ndarray:
+        """(N,3) standard deviations as they looked in the pictures that the asset was fitted to, where the
+        rasteriser blurred by BLUR px². Renderers which do not, or at a higher resolution, show holes
+        between Gaussians with the plain `scale`. Equal to it where clip.pixel is 0."""
+        return np.sqrt(self.scale**2 + np.float32(BLUR * self.clip.pixel**2))
+
+    def softened(self) -> Asset:
+        """The same with `soft_scale` for good (clip.pixel 0), for viewers that know nothing of pixels."""
+        return replace(self, scale=self.soft_scale(), clip=replace(self.clip, pixel=0.0))
+
 
 ARRAYS = tuple(f.name for f in fields(Asset) if f.name != "clip")
 _WIDTHS = {"xyz": 3, "velocity": 3, "scale": 3, "rotation": 4, "rgb": 3}
@@ -119,10 +131,16 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
     if np.abs(np.linalg.norm(asset.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
         raise bad("rotation holds quaternions that are not of unit length")
     c = asset.clip
-    if not (np.isfinite([c.fps, c.scale, *c.translation]).all() and c.fps > 0 and c.scale > 0):
-        raise bad("fps and scale must be positive and finite, and translation finite")
+    numbers = [c.fps, c.scale, c.pixel, *c.translation]
+    if not (np.isfinite(numbers).all() and c.fps > 0 and c.scale > 0 and c.pixel >= 0):
+        raise bad("fps and scale must be positive, pixel not negative, and these and translation finite")
     if len(c.translation) != 3 or c.frame_end < c.frame_start:
         raise bad("the clip's frame range is empty or its translation is not three numbers")
+
+
+def pixel_size(sequence: Sequence) -> float:
+    """Clip.pixel: the median over the views of a pixel's size at the origin, in normalised units."""
+    return float(np.median([np.linalg.norm(v.c2w[:3, 3]) / v.fx for v in sequence.views]))
 
 
 def rotation_matrices(q: np.ndarray) -> np.ndarray:
@@ -186,6 +204,7 @@ def write_ply(path: str | Path, asset: Asset) -> None:
     meta = {"version": VERSION, "fps": repr(float(c.fps)), "frame_start": c.frame_start}
     meta |= {"frame_end": c.frame_end, "scale": repr(float(c.scale))}
     meta |= {"translation": " ".join(repr(float(x)) for x in c.translation), "colour_space": "sRGB"}
+    meta |= {"pixel": repr(float(c.pixel))}
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment timesplat {k} {v}" for k, v in meta.items()]
     header += [f"element vertex {len(asset)}", *(f"property float {p}" for p in GAUSSIAN_3D + TIME_4D)]
@@ -308,6 +327,7 @@ def _clip(meta: dict[str, str], path: Path) -> Clip:
             frame_end=int(meta["frame_end"]),
             scale=float(meta["scale"]),
             translation=(x, y, z),
+            pixel=float(meta.get("pixel", 0)),
         )
     except (KeyError, ValueError) as e:
         if isinstance(e, InputError):

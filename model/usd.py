@@ -14,6 +14,7 @@ What is sampled over time
                 the file a third of the size. The exact ones can be had from primvars:gs4d:*.
     widths      one a frame: 0 while the Gaussian is invisible, so that a viewer of mere points shows
                 only what is there.
+`scales` are `Asset.soft_scale`, which has no holes at any resolution; primvars:gs4d:scale are the plain ones.
 Spherical harmonics are sRGB-encoded, as in every 3DGS file; displayColor is linear, as USD wants it.
 """
 
@@ -30,7 +31,7 @@ from .asset import SH_C0, VISIBLE, Asset, Clip, atomic, check, linear_from_srgb,
 
 SPLAT = "ParticleField3DGaussianSplat"
 PRIM = "/timesplat/splats"
-BOX = 2.0  # how far, in normalised units, an invisible point may stray before positions are sampled per frame
+BOX = 5.0  # how far, in normalised units, an invisible point may stray before positions are sampled per frame
 REACH = 4.0  # lifetimes after which a Gaussian stands still: exp(-½·4²) rounds to an opacity of 0
 EXTENT_SIGMAS = 3.0
 HALF_TINY, HALF_MAX = 2.0**-14, 65504.0
@@ -147,14 +148,15 @@ def _stage(asset: Asset, points_only: bool, half: bool, path: Path):
     put("extent", T.Float3Array, f3(_extent(asset)))
 
     scales = packed(s3, small(asset.scale))
+    prim.SetCustomDataByKey("timesplat:pixel", float(clip.pixel))
     rotations = packed(quats, asset.rotation[:, [1, 2, 3, 0]])  # FromNumpy takes x y z w
+    put("primvars:gs4d:scale", kind3, scales, primvar=True)  # stored once where both are the same
     if points_only:
-        put("primvars:gs4d:scale", kind3, scales, primvar=True)
         put("primvars:gs4d:rotation", kind4, rotations, primvar=True)
         put("primvars:gs4d:rgb", kind3, packed(s3, asset.rgb), primvar=True)
     else:
         put("positions", T.Point3fArray, positions)
-        put(f"scales{h}", kind3, scales)
+        put(f"scales{h}", kind3, packed(s3, small(asset.soft_scale())))
         put(f"orientations{h}", kind4, rotations)
         put("opacities", T.FloatArray, _changing(f1, faded))  # stored once, with displayOpacity
         put("radiance:sphericalHarmonicsDegree", T.Int, 0, uniform=True)
@@ -193,7 +195,7 @@ def _positions(asset: Asset, path: Path) -> dict[float, np.ndarray]:
 def _widths(asset: Asset, curve: dict[float, np.ndarray]) -> dict[float, np.ndarray]:
     """Diameters for readers of points: twice the middle standard deviation, which covers a flat splat's
     face, rounded to 256 steps of its logarithm (few values make a small file); 0 while invisible."""
-    middle = np.log(np.sort(asset.scale, axis=1)[:, 1])
+    middle = np.log(np.sort(asset.soft_scale(), axis=1)[:, 1])
     step = max((middle.max() - middle.min()) / 255, 1e-9)
     width = 2 * np.exp(np.round((middle - middle.min()) / step) * step + middle.min())
     return {code: np.where(o >= VISIBLE, width, 0).astype(np.float32) for code, o in curve.items()}
@@ -210,7 +212,7 @@ def _changing(to, samples: dict[float, np.ndarray]):
 def _extent(asset: Asset) -> np.ndarray:
     """(2,3) bounds of all Gaussians (three sigmas) at the frames where they are visible; of all of them at
     their own times if none ever is."""
-    M = rotation_matrices(asset.rotation) * asset.scale[:, None, :]
+    M = rotation_matrices(asset.rotation) * asset.soft_scale()[:, None, :]
     reach = EXTENT_SIGMAS * np.sqrt((M**2).sum(-1))
     low, high = [], []
     for frame in asset.clip.frames:
@@ -267,15 +269,16 @@ def read_usd(path: str | Path) -> Asset:
             frame_end=round(stage.GetEndTimeCode()),
             scale=prim.GetAttribute("xformOp:scale").Get()[0],
             translation=tuple(prim.GetAttribute("xformOp:translate").Get()),
+            pixel=float(prim.GetCustomDataByKey("timesplat:pixel") or 0),
         )
-    except (TypeError, IndexError, RuntimeError):
+    except (TypeError, ValueError, IndexError, RuntimeError):
         raise InputError(f"{path}: orientations or xformOps are damaged; export it again.") from None
     asset = Asset(
         xyz=get("primvars:gs4d:position"),
         t=get("primvars:gs4d:mu_t"),
         velocity=get("primvars:gs4d:velocity"),
         sigma_t=get("primvars:gs4d:sigma_t"),
-        scale=get("scales", "scalesh", "primvars:gs4d:scale"),
+        scale=get("primvars:gs4d:scale"),
         rotation=rotation,
         rgb=rgb,
         opacity=get("primvars:gs4d:opacity"),

@@ -20,7 +20,7 @@ from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
 from timesplat.model.asset import Asset, Clip, linear_from_srgb, read_ply, rotation_matrices, write_ply
 
 ROOT = Path(__file__).resolve().parent.parent
-CLIP = Clip(23.976, 10, 33, 2.5, (1.0, -2.0, 3.0))
+CLIP = Clip(23.976, 10, 33, 2.5, (1.0, -2.0, 3.0), pixel=0.03)
 
 
 def make(n=300, seed=0, clip=CLIP) -> Asset:
@@ -97,7 +97,7 @@ def test_evaluated_attributes_are_those_of_numpy(tmp_path):
         np.testing.assert_allclose(got["position"], position[seen], atol=1e-5)
         np.testing.assert_allclose(got["alpha"], opacity[seen], atol=1e-5)
         np.testing.assert_allclose(np.array(got["color"])[:, :3], linear_from_srgb(asset.rgb)[seen], atol=1e-6)
-        s = np.sort(asset.scale[seen], 1)
+        s = np.sort(asset.soft_scale()[seen], 1)
         np.testing.assert_allclose(got["radius"], s[:, 1] if look == "Points" else 3 * s[:, 2], rtol=1e-5)
         np.testing.assert_allclose(got["world"], position[seen][:5] * 2.5 + [1, -2, 3], atol=2e-5)
 
@@ -140,9 +140,10 @@ def test_splats_are_rendered_as_the_formula_says(tmp_path):
     f = focal_from_fov(50, size)
     ray = np.stack([(x - size / 2) / f, (y - size / 2) / f, np.ones_like(x)], -1) @ c2w[:3, :3].T
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    reach = 3 * asset.scale.max(1)
+    scale = asset.soft_scale()
+    reach = 3 * scale.max(1)
     offset = c2w[:3, 3] - position  # (N,3)
-    M = (rotation_matrices(asset.rotation) / asset.scale[:, None]).transpose(0, 2, 1)
+    M = (rotation_matrices(asset.rotation) / scale[:, None]).transpose(0, 2, 1)
     w = np.einsum("nij,yxj->nyxi", M, ray)
     u = np.einsum("nij,nj->ni", M, offset)[:, None, None]
     d2 = (np.cross(u, w) ** 2).sum(-1) / (w**2).sum(-1)

@@ -63,6 +63,7 @@ def assets(draw):
             start + draw(st.integers(0, 500)),
             draw(st.floats(1e-6, 1e6)),
             tuple(draw(st.tuples(*[st.floats(-1e9, 1e9)] * 3))),
+            draw(st.floats(0, 1)),
         ),
     )
 
@@ -149,6 +150,23 @@ def test_at_is_the_kinematic_form():
     assert [a.frame_to_time(f) for f in (3, 26)] == [-1, 1] and abs(a.frame_to_time(14.5)) < 1e-12
     assert Clip(24, 5, 5).frame_to_time(5) == 0
     np.testing.assert_allclose(a.clip.frame_to_time(np.array([3, 26])), [-1, 1])
+
+
+def test_softened_is_what_a_blurring_rasteriser_shows():
+    a = make(clip=Clip(pixel=0.02))
+    np.testing.assert_allclose(a.soft_scale() ** 2, a.scale**2 + 0.3 * 0.02**2, rtol=1e-5)
+    soft = a.softened()
+    np.testing.assert_array_equal(soft.scale, a.soft_scale())
+    np.testing.assert_array_equal(soft.scale, soft.soft_scale())
+    assert soft.xyz is a.xyz and a.clip.pixel == 0.02
+    check(soft)
+
+
+def test_files_without_the_pixel_comment_are_read(tmp_path):
+    write_ply(tmp_path / "a.ply", make(3))
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"comment timesplat pixel 0.0\n", b""))
+    assert read_ply(tmp_path / "a.ply").clip.pixel == 0
 
 
 def refused(path, *words):

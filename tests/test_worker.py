@@ -61,6 +61,7 @@ def test_lift(tmp_path, sequence):
     assert len(steps) > 2 and steps == sorted(steps) and all(s["event"] == "progress" and s["text"] for s in said[:-1])
     a = read_ply(asset)
     assert len(a) == said[-1]["gaussians"] > 100 and (a.clip.frame_start, a.clip.frame_end) == (0, 3)
+    np.testing.assert_allclose(a.clip.pixel, 2.7 * 2 * np.tan(np.radians(25)) / 32, rtol=1e-6)
     assert np.abs(np.linalg.norm(a.xyz, axis=1) - 0.6).max() < 0.1
 
 
