@@ -322,6 +322,59 @@ def test_reconstruct_headless_with_lift(extension, tmp_path):
         assert word in errors[key] and "Traceback" not in errors[key] and "\n" not in errors[key], errors
 
 
+MODAL = """
+import os, time, types, tempfile
+tempfile.tempdir = sys.argv[1]
+import timesplat.addon
+from timesplat.addon import process
+from timesplat.addon.reconstruct import TIMESPLAT_OT_reconstruct as Operator
+timesplat.addon.register()
+bpy.context.scene.frame_end = 1
+process.LAUNCH = '''
+import json, sys, time
+print(json.dumps({"event": "progress", "fraction": 0.5, "text": "half"}), flush=True)
+time.sleep(99)
+'''
+Operator.execute = lambda self, context: self.invoke(context, None)  # in background nothing invokes
+told = {}
+for how in ("ESC", "button", "file", "dies"):
+    if how == "dies":
+        process.LAUNCH = "import sys; sys.exit('out of memory')"
+    started = bpy.ops.timesplat.reconstruct(method="lift", size=16, samples=1)
+    operator = Operator.active
+    worker = operator.worker.process
+    event = lambda kind: operator.modal(bpy.context, types.SimpleNamespace(type=kind))
+    seen, end = [], None
+    for _ in range(200):
+        end = event("TIMER")
+        seen.append(operator.fraction)
+        if operator.fraction > 0.5 or end != {"PASS_THROUGH"}:
+            break
+        time.sleep(0.05)
+    busy = [event("MOUSEMOVE") == {"PASS_THROUGH"}, bpy.ops.timesplat.reconstruct.poll()] if how != "dies" else []
+    if how == "ESC":
+        end = event("ESC")
+    if how == "button":
+        bpy.ops.timesplat.cancel()
+        end = event("MOUSEMOVE")
+    if how == "file":
+        bpy.ops.wm.read_factory_settings()
+        end = []
+    told[how] = dict(started=list(started), last=seen[-1], busy=busy, end=list(end), dead=worker.poll() is not None,
+                     free=Operator.active is None, left=os.listdir(sys.argv[1]))
+tell(**told)
+"""
+
+
+def test_the_panels_button_never_blocks_and_can_be_cancelled(tmp_path):
+    told = blender(MODAL, tmp_path)
+    for how, t in told.items():
+        assert t["started"] == ["RUNNING_MODAL"] and t["dead"] and t["free"] and t["left"] == [], (how, t)
+        assert t["end"] == ([] if how == "file" else ["CANCELLED"]), (how, t)
+        if how != "dies":
+            assert t["last"] == pytest.approx(0.65) and t["busy"] == [True, False], (how, t)
+
+
 SPREAD = """
 from timesplat.addon.reconstruct import spread
 tell(all=[[spread(1, e, n) for n in (1, 2, 8, 24)] for e in (1, 2, 24, 40, 250)])
