@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Many assets to Sequences: `timesplat render`.
 
-Each asset is opened and rendered in a child process of its own (this module, run with a job file), so that
-one that crashes Blender or eats the memory never takes the others with it. The child writes its messages as
-JSON lines; what Blender prints goes to a log of which the last line is shown if it dies.
+Each asset is opened and rendered in a child process of its own (`child`, run with a job file), so that one
+that crashes Blender or eats the memory never takes the others with it. The child writes its messages as JSON
+lines; what Blender prints goes to a log of which the last line is shown if it dies.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
+import hashlib
 import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
-import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -24,7 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from . import ASSET_SUFFIXES
-from .rigs import RIGS, targets
+from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
 
 FIRST, MOST, ALL = "first", "most-moving", "all"
@@ -194,16 +193,24 @@ def zoo_seed(asset: str) -> str | None:
     return match[1] if match else None
 
 
+def is_made(folder: Path, asset: str, settings: Settings) -> int:
+    """How many clips the run had that made this Sequence, if it is whole and shows this very asset with
+    these settings; else 0."""
+    try:
+        made = read_sequence(folder).provenance
+        same = made["settings"] == asdict(settings) and made["asset"] == Path(asset).name
+        if same and not zoo_seed(asset):
+            same = made["sha256"] == hashlib.sha256(Path(asset).read_bytes()).hexdigest()
+        return made["clips"] if same else 0
+    except (InputError, KeyError, OSError):
+        return 0
+
+
 def _finished(asset: str, folder: Path, settings: Settings) -> list[Path]:
     """The Sequences of this asset with these settings, if all its clips are there and whole; else none."""
-    found, wanted = [], None
-    for file in sorted(folder.glob("*/transforms.json")):
-        with contextlib.suppress(InputError):
-            made = read_sequence(file.parent).provenance
-            if made.get("settings") == asdict(settings) and made.get("asset") == Path(asset).name:
-                found.append(file.parent)
-                wanted = made.get("clips")
-    return found if len(found) == wanted else []
+    folders = [file.parent for file in sorted(folder.glob("*/transforms.json"))]
+    found = {f: clips for f in folders if (clips := is_made(f, asset, settings))}
+    return list(found) if found and len(found) == max(found.values()) else []
 
 
 def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
@@ -211,7 +218,7 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
     with tempfile.TemporaryDirectory(prefix="timesplat-") as tmp:
         file, log = Path(tmp) / "job.json", Path(tmp) / "log"
         file.write_text(json.dumps(job))
-        command = [sys.executable, "-m", "timesplat.datagen.render", str(file), str(log)]
+        command = [sys.executable, "-m", "timesplat.datagen.child", str(file), str(log)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
         running.add(process)
         said_error = False
@@ -230,120 +237,6 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
             lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
             last = f", last line: {lines[-1][:200]}" if lines else ""
             on({"error": f"{job['asset']}: Blender died on it ({reason}{last}); repair or leave out the file."})
-
-
-# ---------------------------------------------------------------- in the child
-
-
-def _run_job(job: dict, say: Callable[[dict], None]) -> None:
-    from . import capture, displace, scene
-    from .clips import Clip
-
-    settings, asset = Settings(**job["settings"]), job["asset"]
-    provenance: dict = {"asset": Path(asset).name, **scene.versions()}
-    if seed := zoo_seed(asset):
-        from . import zoo
-
-        scene.empty()
-        provenance["zoo"] = zoo.build(int(seed))
-        opened = scene.Asset(Path(asset), "", [Clip("zoo", 1, 24)])
-    else:
-        opened = scene.open_asset(Path(asset))
-        provenance["sha256"] = opened.sha256
-    for warning in opened.warnings:
-        say({"warning": warning})
-    clips = choose(opened, settings)
-    provenance |= {"settings": asdict(settings), "clips": len(clips), "warnings": opened.warnings}
-    for slug, clip in _slugs(clips).items():
-        folder = Path(job["folder"]) if "folder" in job else Path(job["out"]) / slug
-        opened.play(clip)
-        frames = clip.frames(settings.frames)
-        if settings.displace:
-            frames = frames[:1] * settings.frames
-        norm, aabb = scene.normalisation(frames, name=asset)
-        # every clip of every object gets cameras of its own
-        seed = zlib.crc32(f"{settings.seed}/{stem(asset)}/{clip.name}".encode())
-        shift = None
-        if settings.displace:
-            norm, aabb, shift = displace.displacements(norm, aabb, len(frames), seed)
-        numbers = list(range(len(frames)))
-        shots = RIGS[settings.rig](numbers, seed) + targets(numbers, seed, settings.targets)
-        before = 0
-
-        def progress(done: int, total: int) -> None:
-            nonlocal before
-            say({"image": done - before, "of": total})
-            before = done
-
-        capture.capture(
-            shots,
-            folder,
-            frames=frames,
-            normalisation=norm,
-            aabb=aabb,
-            size=settings.size,
-            samples=settings.samples,
-            passes=settings.passes,
-            linear=settings.linear,
-            device=settings.device,
-            seed=seed % 2**20,
-            shift=shift,
-            provenance=provenance | {"clip": clip.name, "scene_frames": frames, "cameras_seed": seed},
-            progress=progress,
-        )
-        say({"written": str(folder)})
-
-
-def choose(opened, settings: Settings) -> list:
-    """The clips that `settings.clip` asks for. InputError naming those that exist if there is none such."""
-    from . import scene
-
-    if settings.clip == ALL:
-        return opened.clips
-    if settings.clip == FIRST:
-        return opened.clips[:1]
-    if settings.clip == MOST:
-        return [scene.most_moving(opened, settings.frames)]
-    chosen = [c for c in opened.clips if c.name == settings.clip]
-    if not chosen:
-        names = ", ".join(c.name for c in opened.clips)
-        raise InputError(f"{opened.path}: it has no clip named {settings.clip}; it has {names}.")
-    return chosen[:1]
-
-
-def _slugs(clips: list) -> dict:
-    """Clip -> a file name of its own for each."""
-    named = {}
-    for clip in clips:
-        slug = base = re.sub(r"[^A-Za-z0-9]+", "-", clip.name).strip("-") or "clip"
-        n = 2
-        while slug in named:
-            slug, n = f"{base}-{n}", n + 1
-        named[slug] = clip
-    return named
-
-
-def _child_main(job_file: str, log: str) -> int:
-    job = json.loads(Path(job_file).read_text())
-    out = os.fdopen(os.dup(1), "w", buffering=1)
-    sink = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(sink, 1)
-    os.dup2(sink, 2)
-    if job["cores"] and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, job["cores"])  # before Blender starts its threads
-    say = lambda message: print(json.dumps(message), file=out)  # noqa: E731
-    try:
-        _run_job(job, say)
-    except InputError as e:
-        say({"error": str(e)})
-        return 2
-    except MemoryError:
-        say({"error": f"{job['asset']}: the memory does not suffice; render it smaller or alone."})
-        return 1
-    except Exception as e:
-        say({"error": f"{job['asset']}: rendering failed ({type(e).__name__}: {e}); please report it."})
-        return 1
-    return 0
 
 
 # ---------------------------------------------------------------- the command line
@@ -401,8 +294,3 @@ def parse_seeds(text: str | None) -> list[int]:
         elif text:
             raise InputError(f"--zoo {text}: not a list of seeds; write for example 0-99 or 3,7,10-12.")
     return seeds
-
-
-if __name__ == "__main__":
-    status = _child_main(*sys.argv[1:])
-    os._exit(status)  # Blender's own way out is slow, and can crash after all is written

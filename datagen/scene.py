@@ -13,6 +13,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import unquote
 
 import bpy
 import numpy as np
@@ -120,7 +121,7 @@ def _check_gltf(path: Path) -> None:
     for kind, uri in used:
         if not uri or uri.startswith("data:"):
             continue
-        file = _inside(path, uri)
+        file = _inside(path, unquote(uri))
         if kind == "buffers" and not file.is_file():
             raise InputError(f"{path}: its data file {uri} is missing; put it beside it.")
 

@@ -220,9 +220,16 @@ def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) ->
 
     `fill(tmp)` puts the images and passes below the temporary folder and sets each view's `image` (and
     `passes`) to its relative path; then transforms.json is written and the folder moved into place,
-    replacing an older one. Returns the Sequence as read back. On any error nothing stays behind.
+    replacing an older Sequence (and nothing else: InputError). Returns it as read back. On any error nothing
+    stays behind.
     """
     folder = Path(folder)
+    if (
+        folder.exists()
+        and not (folder / "transforms.json").is_file()
+        and (not folder.is_dir() or any(folder.iterdir()))
+    ):
+        raise InputError(f"{folder}: it exists and is not a Sequence; it is not overwritten, give another name.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
