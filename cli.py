@@ -84,6 +84,7 @@ def train_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")
     p.add_argument("--views", type=int, default=24, help="input views of a sample (default: 24)")
     p.add_argument("--targets", type=int, default=8, help="supervision views of a sample (default: 8)")
+    p.add_argument("--shrink", type=int, default=1, help="train at 1/N of the rendered size (curriculum; default: 1)")
     p.add_argument("--rate", type=float, default=4e-4, help="peak learning rate (default: 4e-4)")
     p.add_argument("--accumulate", type=int, default=1, help="samples per step (default: 1)")
     p.add_argument("--geometric", type=float, default=0.0, help="weight of the geometric loss, for RGB sources")

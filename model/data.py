@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 from tqdm import tqdm
 
 from ..datagen.sequence import InputError, read_sequence
@@ -81,8 +82,10 @@ def pack(folder: Path, cache: Path) -> Path:
 class Clips:
     """Packed clips and random samples of them."""
 
-    def __init__(self, folders: list[Path], cache: Path):
-        """folders: Sequence folders, or folders that hold them at any depth. Raises InputError if none."""
+    def __init__(self, folders: list[Path], cache: Path, shrink: int = 1):
+        """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
+        than what was rendered. Raises InputError where there is no Sequence."""
+        self.shrink = shrink
         found = [p.parent for f in folders for p in sorted(Path(f).rglob("transforms.json"))]
         if not found:
             raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
@@ -102,7 +105,8 @@ class Clips:
             weight[chosen] = 0
             picked = rng.choice(len(frame), targets, replace=False, p=weight / weight.sum())
             step = 2 / max(int(meta["frames"]) - 1, 1)
-            return Sample(_views(f, chosen, step), _views(f, picked, step), meta["asset"])
+            inputs, held_out = (shrink(_views(f, i, step), self.shrink) for i in (chosen, picked))
+            return Sample(inputs, held_out, meta["asset"])
 
 
 CANONICAL = ("front", "left", "back", "right")
@@ -146,3 +150,27 @@ def _views(f, indices: np.ndarray, step: float) -> Views:
     rgba = packed[..., :4].float() / 255
     tensors = [f.get_tensor(k)[rows] for k in ("c2w", "intrinsics", "time")]
     return Views(rgba[..., :3], rgba[..., 3], *tensors, step, depth, flow)
+
+
+def shrink(views: Views, by: int) -> Views:
+    """The views at 1/by of their size: colours and alpha are averaged as light is, depth and motion over the
+    surface nearest to the camera in each block."""
+    if by == 1:
+        return views
+    height, width = (n // by for n in views.size)
+
+    def blocks(x: Tensor) -> Tensor:  # (V,H,W,C) -> (V,h,w,by²,C)
+        x = x[:, : height * by, : width * by].reshape(len(views), height, by, width, by, -1)
+        return x.transpose(2, 3).flatten(3, 4)
+
+    alpha = blocks(views.alpha[..., None])
+    total = alpha.mean(3)
+    rgb = (blocks(views.rgb) * alpha).mean(3) / total.clamp_min(1e-6)
+    depth, flow = blocks(views.depth[..., None]), blocks(views.flow)
+    near = depth <= depth.amin(3, keepdim=True) + 0.05
+    near &= torch.isfinite(depth)
+    count = near.sum(3)
+    mean = (torch.where(near, depth, 0.0).sum(3) / count.clamp_min(1))[..., 0]
+    flow = torch.where(near, flow, 0.0).sum(3) / count.clamp_min(1) / by
+    depth = torch.where(count[..., 0] > 0, mean, torch.inf)
+    return Views(rgb, total[..., 0], views.c2w, views.intrinsics / by, views.time, views.frame_step, depth, flow)

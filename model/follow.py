@@ -24,10 +24,10 @@ GRID = 32  # voxels along [-EXTENT, EXTENT]
 EXTENT = 1.15
 BEYOND = (0.4, 0.1)  # weight of what is known one and two intervals away
 COARSE, COARSEST = 1e-2, 1e-5  # weights of the levels that fill in
-TOLERANCE = 2.0  # depth agreement, in pixel sizes, plus …
+TOLERANCE = 1.3  # depth agreement, in pixel sizes, plus …
 DRIFT = 0.5  # … this per frame of following
 LONGEST = 8.0  # frames that a point is followed
-FRONTAL = 0.3  # a view that sees a surface under a cosine above this may take over from another
+FRONTAL = 0.15  # a view that sees a surface under a cosine above this may take over from another
 HANDOVER = 0.45  # a point is needed for this part of the time until another view takes over
 STRAIGHT = 0.5  # a piece's greatest distance from its chord, in pixel sizes
 PIECES = 8  # most pieces per track
@@ -94,53 +94,84 @@ def scene_flow(views: Views, points: Points, A: Tensor, next_b: Tensor, previous
         inside = (interval >= 0) & (interval < intervals)
         row = torch.cat([normal_matrix, (A * b[..., None]).sum(1)], -1)
         sums.index_add_(0, (interval * GRID**3 + cell)[inside], row[inside])
-    sums = sums.reshape(intervals, GRID, GRID, GRID, 9)
-    near = sums.clone()
-    for away, weight in enumerate(BEYOND, 1):
-        if away < intervals:
-            near[away:] += weight * sums[:-away]
-            near[:-away] += weight * sums[away:]
-    quarter = GRID // 4
-    coarse = near.reshape(intervals, quarter, 4, quarter, 4, quarter, 4, 9).sum((2, 4, 6)) / 64
-    whole = coarse.mean((1, 2, 3), keepdim=True)
-    coarse = COARSE * _spread(coarse) + COARSEST * whole
-    total = _spread(near).reshape(intervals, quarter, 4, quarter, 4, quarter, 4, 9)
-    total += coarse[:, :, None, :, None, :, None]
-    return torch.from_numpy(_solve(total.reshape(-1, 9).numpy())).reshape(intervals, GRID, GRID, GRID, 3)
-
-
-def _spread(x: Tensor) -> Tensor:
-    """Blurs (T,G,G,G,C) by the triangle 1 2 3 2 1 along each of the three axes, zero outside; in place."""
-    for axis in (1, 2, 3):
-        n = x.shape[axis]
-        for _ in range(2):
-            y = x.clone()
-            x.narrow(axis, 1, n - 1).add_(y.narrow(axis, 0, n - 1))
-            x.narrow(axis, 0, n - 1).add_(y.narrow(axis, 1, n - 1))
-        x /= 9
-    return x
+    sums = sums.reshape(intervals, GRID, GRID, GRID, 9).numpy()
+    return torch.from_numpy(_field(sums, np.array([1, *BEYOND], np.float32), np.float32(COARSE), np.float32(COARSEST)))
 
 
 @numba.njit(cache=True, parallel=True, fastmath=True)
-def _solve(rows):
-    """(n,9) upper triangles and right-hand sides of 3x3 normal equations -> (n,3), by Cramer's rule. A small
-    multiple of the trace keeps the component that nothing constrains at zero."""
-    n = len(rows)
-    out = np.zeros((n, 3), np.float32)
-    for k in numba.prange(n):
-        a, b, c, d, e, f = rows[k, 0], rows[k, 1], rows[k, 2], rows[k, 3], rows[k, 4], rows[k, 5]
-        trace = a + d + f
-        if trace < 1e-12:
-            continue
-        scale = 1 / trace
-        a, b, c, d, e, f = a * scale + 1e-3, b * scale, c * scale, d * scale + 1e-3, e * scale, f * scale + 1e-3
-        p, q, r = rows[k, 6] * scale, rows[k, 7] * scale, rows[k, 8] * scale
-        A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-        inverse = 1 / (a * A + b * B + c * C)
-        out[k, 0] = (A * p + B * q + C * r) * inverse
-        out[k, 1] = (B * p + (a * f - c * c) * q + (b * c - a * e) * r) * inverse
-        out[k, 2] = (C * p + (b * c - a * e) * q + (a * d - b * b) * r) * inverse
+def _field(sums, beyond, coarse_weight, coarsest_weight):
+    """sums (T,G,G,G,9): upper triangles and right-hand sides of normal equations per interval and voxel, to be
+    joined with those of neighbours in time and space -> their solutions (T,G,G,G,3)."""
+    intervals, G = sums.shape[0], sums.shape[1]
+    Q = G // 4
+    out = np.zeros((intervals, G, G, G, 3), np.float32)
+    for t in numba.prange(intervals):
+        near = np.zeros((G, G, G, 9), np.float32)
+        for away in range(-len(beyond) + 1, len(beyond)):
+            if 0 <= t + away < intervals:
+                weight, other = beyond[abs(away)], sums[t + away]
+                for x in range(G):
+                    for y in range(G):
+                        for z in range(G):
+                            for c in range(9):
+                                near[x, y, z, c] += weight * other[x, y, z, c]
+        coarse = np.zeros((Q, Q, Q, 9), np.float32)
+        whole = np.zeros(9, np.float32)
+        for x in range(G):
+            for y in range(G):
+                for z in range(G):
+                    for c in range(9):
+                        coarse[x // 4, y // 4, z // 4, c] += near[x, y, z, c] / 64
+        _blur(coarse)
+        for x in range(Q):
+            for y in range(Q):
+                for z in range(Q):
+                    for c in range(9):
+                        whole[c] += coarse[x, y, z, c] / (Q * Q * Q)
+        _blur(near)
+        rows = np.empty(9, np.float32)
+        for x in range(G):
+            for y in range(G):
+                for z in range(G):
+                    for c in range(9):
+                        rows[c] = near[x, y, z, c] + coarse_weight * coarse[x // 4, y // 4, z // 4, c]
+                        rows[c] += coarsest_weight * whole[c]
+                    _solve(rows, out[t, x, y, z])
     return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def _blur(x):
+    """Blurs (n,n,n,9) by the triangle 1 2 3 2 1 along each axis, zero outside; in place."""
+    n = x.shape[0]
+    line = np.zeros((n + 4, 9), np.float32)
+    for axis in range(3):
+        for a in range(n):
+            for b in range(n):
+                row = x[:, a, b] if axis == 0 else (x[a, :, b] if axis == 1 else x[a, b])
+                line[2 : n + 2] = row
+                for k in range(n):
+                    for c in range(9):
+                        row[k, c] = (
+                            line[k, c] + line[k + 4, c] + 2 * (line[k + 1, c] + line[k + 3, c]) + 3 * line[k + 2, c]
+                        ) / 9
+
+
+@numba.njit(cache=True, fastmath=True)
+def _solve(row, out):
+    """Upper triangle and right-hand side (9) of 3x3 normal equations -> out (3), by Cramer's rule. A small
+    multiple of the trace keeps the component that nothing constrains at zero."""
+    trace = row[0] + row[3] + row[5]
+    if trace < 1e-12:
+        return
+    s = 1 / trace
+    a, b, c, d, e, f = row[0] * s + 1e-3, row[1] * s, row[2] * s, row[3] * s + 1e-3, row[4] * s, row[5] * s + 1e-3
+    p, q, r = row[6] * s, row[7] * s, row[8] * s
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    inverse = 1 / (a * A + b * B + c * C)
+    out[0] = (A * p + B * q + C * r) * inverse
+    out[1] = (B * p + (a * f - c * c) * q + (b * c - a * e) * r) * inverse
+    out[2] = (C * p + (b * c - a * e) * q + (a * d - b * b) * r) * inverse
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")

@@ -19,8 +19,8 @@ from .follow import Points, follow
 from .gaussians import Gaussians4D, quaternion
 from .views import Views, camera_rays
 
-FOOTPRINT = 0.25  # σ of a Gaussian in pixels of the view that made it
-STRETCH = 4.0  # a slanted pixel's footprint grows at most by this
+FOOTPRINT = 0.35  # σ of a Gaussian in pixels of the view that made it
+STRETCH = 2.5  # a slanted pixel's footprint grows at most by this
 THICKNESS = 0.15  # σ along the normal, in pixels
 INSET = 1.0  # how far below the surface a Gaussian sits, in pixels: its own width reaches back out to it
 OPACITY = 0.95

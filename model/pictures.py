@@ -21,9 +21,7 @@ def grid(rows: dict[str, torch.Tensor], columns: list[str]) -> Image.Image:
     """{label: (n,H,W,3) pictures 0..1} and n column titles -> one labelled picture, a row per label."""
     n, height, width = next(iter(rows.values())).shape[:3]
     font = ImageFont.load_default(13)
-    sheet = Image.new(
-        "RGB", (LABEL + n * (width + MARGIN), 20 + len(rows) * (height + MARGIN)), "white"
-    )
+    sheet = Image.new("RGB", (LABEL + n * (width + MARGIN), 20 + len(rows) * (height + MARGIN)), "white")
     pen = ImageDraw.Draw(sheet)
     for i, title in enumerate(columns):
         pen.text((LABEL + i * (width + MARGIN) + 4, 3), title, fill="black", font=font)

@@ -16,12 +16,14 @@ import numpy as np
 import torch
 
 from .gaussians import Gaussians4D, quaternion
-from .lift import FEATURES, OPACITY, Geometry, tangent_frame
+from .lift import FEATURES, Geometry, tangent_frame
 from .views import Views, camera_rays
 
 CANDIDATES = 64  # distances along a ray, over its way through the unit box
 MEMORY = 1.5  # frames after which another view's word counts 1/e
 COLOUR = 0.25  # RMS colour difference at which agreement has fallen to exp(-½)
+LIFE = 0.6  # σ_t as a multiple of half the time until another view looks from the same side
+OPACITY = 0.7  # less than the lift's: places are less sure, and several views overlap
 DENSITY = 0.5  # how much of the remaining ray an undisputed candidate takes
 
 
@@ -53,7 +55,7 @@ def sweep_geometry(views: Views) -> Geometry:
         xyz=world,
         t=views.time[:, None, None].expand_as(depth),
         velocity=torch.zeros_like(world),
-        sigma_t=1.3 * span * step,
+        sigma_t=LIFE * span * step,
         scale=scale,
         rotation=quaternion((R[:, None, None] @ axes).expand(*depth.shape, 3, 3)),
         rgb=views.rgb,

@@ -34,7 +34,7 @@ CLIP = 1.0  # gradient norm; steps beyond 20 times that are skipped
 
 def run(args: argparse.Namespace) -> int:
     """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
-    clips = Clips(args.data, args.cache)
+    clips = Clips(args.data, args.cache, args.shrink)
     config = replace(PRESETS[args.preset], head=args.head, source=args.source, depth_range=args.depth_range)
     torch.manual_seed(args.seed)
     network = Network(config)
