@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from ..datagen.sequence import InputError, Sequence
-from .asset import Clip
+from .asset import Clip, pixel_size
 from .gaussians import Gaussians4D
 from .views import Views, load_views
 
@@ -32,7 +32,7 @@ RGB = "sweep"  # what `rgb` stands for
 def clip_of(seq: Sequence) -> Clip:
     """The Clip that leads an asset of this Sequence back to its scene."""
     n = seq.normalisation
-    return Clip(seq.fps, seq.frame_start, seq.frame_end, n.scale, tuple(n.translation))
+    return Clip(seq.fps, seq.frame_start, seq.frame_end, n.scale, tuple(n.translation), pixel_size(seq))
 
 
 def reconstruct(

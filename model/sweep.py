@@ -21,7 +21,7 @@ from .views import Views, camera_rays
 
 CANDIDATES = 64  # distances along a ray, over its way through the unit box
 MEMORY = 1.5  # frames after which another view's word counts 1/e
-COLOUR = 0.25  # RMS colour difference at which agreement has fallen to exp(-½)
+AGREE = 2.5  # agreement in colour is 1 / (1 + AGREE · squared distance)
 LIFE = 0.6  # σ_t as a multiple of half the time until another view looks from the same side
 OPACITY = 0.7  # less than the lift's: places are less sure, and several views overlap
 DENSITY = 0.5  # how much of the remaining ray an undisputed candidate takes
@@ -85,10 +85,23 @@ def _sweep(rgb, alpha, frame, c2w, w2c, K, mask):
     depth = np.zeros((V, H, W), np.float32)
     spread = np.zeros((V, H, W), np.float32)
     certainty = np.zeros((V, H, W), np.float32)
+    silhouette = np.log(np.maximum(alpha, np.float32(0.02)))
     for row in numba.prange(V * H):
         i, v = row // H, row % H
+        # The views that have a say, and where the camera of this one is in theirs.
+        other, say, start = np.empty(V, np.int64), np.empty(V, np.float32), np.empty((V, 3), np.float32)
+        count = 0
+        for j in range(V):
+            dt = abs(frame[j] - frame[i])
+            if j != i and dt < 3.1 * MEMORY:
+                other[count], say[count] = j, np.exp(-dt / MEMORY)
+                for k in range(3):
+                    start[count, k] = w2c[j, k, 3]
+                    for m in range(3):
+                        start[count, k] += w2c[j, k, m] * c2w[i, m, 3]
+                count += 1
         direction = np.empty(3, np.float32)
-        weight = np.empty(CANDIDATES, np.float32)
+        turned = np.empty((V, 3), np.float32)
         for u in range(W):
             if not mask[i, v, u]:
                 continue
@@ -101,42 +114,45 @@ def _sweep(rgb, alpha, frame, c2w, w2c, K, mask):
                     near, far = max(near, min(a, b)), min(far, max(a, b))
             if far <= near:
                 continue
+            for n in range(count):
+                j = other[n]
+                for k in range(3):
+                    turned[n, k] = (
+                        w2c[j, k, 0] * direction[0] + w2c[j, k, 1] * direction[1] + w2c[j, k, 2] * direction[2]
+                    )
+            red, green, blue = rgb[i, v, u]
             step = (far - near) / CANDIDATES
             left, total, mean, square, best = 1.0, 0.0, 0.0, 0.0, 0.0
-            for n in range(CANDIDATES):
-                z = near + (n + 0.5) * step
-                px = c2w[i, 0, 3] + z * direction[0]
-                py = c2w[i, 1, 3] + z * direction[1]
-                pz = c2w[i, 2, 3] + z * direction[2]
-                inside, agree, votes = 0.0, 0.0, 0.0
-                for j in range(V):
-                    dt = abs(frame[j] - frame[i])
-                    if j == i or dt > 4 * MEMORY:
-                        continue
-                    zj = w2c[j, 2, 0] * px + w2c[j, 2, 1] * py + w2c[j, 2, 2] * pz + w2c[j, 2, 3]
+            for candidate in range(CANDIDATES):
+                z = near + (candidate + np.float32(0.5)) * step
+                inside, agree, votes = np.float32(0), np.float32(0), np.float32(0)
+                for n in range(count):
+                    zj = start[n, 2] + z * turned[n, 2]
                     if zj < 0.01:
                         continue
-                    xj = w2c[j, 0, 0] * px + w2c[j, 0, 1] * py + w2c[j, 0, 2] * pz + w2c[j, 0, 3]
-                    yj = w2c[j, 1, 0] * px + w2c[j, 1, 1] * py + w2c[j, 1, 2] * pz + w2c[j, 1, 3]
-                    uj = int(np.floor(xj / zj * K[j, 0] + K[j, 2]))
-                    vj = int(np.floor(yj / zj * K[j, 1] + K[j, 3]))
+                    j = other[n]
+                    scale = 1 / zj
+                    uj = int(np.floor((start[n, 0] + z * turned[n, 0]) * scale * K[j, 0] + K[j, 2]))
+                    vj = int(np.floor((start[n, 1] + z * turned[n, 1]) * scale * K[j, 1] + K[j, 3]))
                     if uj < 0 or vj < 0 or uj >= W or vj >= H:
                         continue
-                    w = np.exp(-dt / MEMORY)
-                    inside += w * np.log(max(alpha[j, vj, uj], np.float32(0.02)))
-                    difference = 0.0
-                    for k in range(3):
-                        difference += (rgb[j, vj, uj, k] - rgb[i, v, u, k]) ** 2
-                    agree += w * np.exp(-difference / (6 * COLOUR * COLOUR))
-                    votes += w
+                    inside += say[n] * silhouette[j, vj, uj]
+                    if inside < -7:
+                        break
+                    d = (rgb[j, vj, uj, 0] - red) ** 2 + (rgb[j, vj, uj, 1] - green) ** 2
+                    d += (rgb[j, vj, uj, 2] - blue) ** 2
+                    agree += say[n] / (1 + d * AGREE)
+                    votes += say[n]
+                if inside < -7:
+                    continue
                 hold = np.exp(inside)
                 if votes > 0:
                     hold *= 0.4 + 0.6 * agree / votes
-                weight[n] = left * DENSITY * hold
+                weight = left * DENSITY * hold
                 left *= 1 - DENSITY * hold
-                total += weight[n]
-                mean += weight[n] * z
-                square += weight[n] * z * z
+                total += weight
+                mean += weight * z
+                square += weight * z * z
                 best = max(best, hold)
             if total < 1e-4:  # no candidate holds: silhouettes contradict each other (fast motion)
                 depth[i, v, u] = 0.5 * (near + far)

@@ -21,7 +21,6 @@ import sys
 import threading
 import time
 import traceback
-from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
 
@@ -62,7 +61,7 @@ def main(argv: list[str]) -> int:
 def _reconstruct(request: dict, progress) -> int:
     progress(0.0, "starting")
     sequence = read_sequence(Path(request["sequence"]))
-    from .asset import pixel_size, write_ply
+    from .asset import write_ply
     from .reconstruct import clip_of, reconstruct  # imports torch
 
     checkpoint = request.get("checkpoint")
@@ -77,8 +76,7 @@ def _reconstruct(request: dict, progress) -> int:
     if len(gaussians) == 0:
         raise InputError(f"{sequence.root}: nothing was found to reconstruct; check that views show the object.")
     progress(0.95, "writing the asset")
-    clip = clip_of(sequence)
-    write_ply(request["asset"], gaussians.to_asset(replace(clip, pixel=clip.pixel or pixel_size(sequence))))
+    write_ply(request["asset"], gaussians.to_asset(clip_of(sequence)))
     return len(gaussians)
 
 

@@ -15,7 +15,7 @@ def test_depth_is_near_the_truth_and_knows_how_near(spheres):
     assert error.median() < 0.4 * guess.median()
     sure = spread[on] < spread[on].median()
     assert error[sure].mean() < error[~sure].mean()
-    assert ((0 <= certainty) & (certainty <= 1)).all()
+    assert ((certainty >= 0) & (certainty <= 1)).all()
 
 
 def test_it_uses_pictures_alone(spheres):
