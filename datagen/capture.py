@@ -165,7 +165,9 @@ def straight_srgb(linear: np.ndarray) -> np.ndarray:
     alpha = np.clip(linear[..., 3:], 0, 1)
     rgb = np.clip(linear[..., :3] / np.maximum(alpha, 1e-6), 0, 1)
     rgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
-    return np.round(np.concatenate([rgb * (alpha > 0), alpha], -1) * 255).astype(np.uint8)
+    rgba = np.round(np.concatenate([rgb, alpha], -1) * 255).astype(np.uint8)
+    rgba[rgba[..., 3] == 0] = 0
+    return rgba
 
 
 def _per_step(passes: Passes, frames: list[int], i: int) -> None:
@@ -232,7 +234,8 @@ def _lights(stage, made: list) -> None:
     """Three suns and a grey world: the same for every object, wherever it lies and however large it is."""
     world = bpy.data.worlds.new("timesplat")
     made.append(world)
-    world.use_nodes = True
+    if bpy.app.version < (5, 0):  # from then on it always has nodes
+        world.use_nodes = True
     background = next(n for n in world.node_tree.nodes if n.type == "BACKGROUND")
     background.inputs["Color"].default_value = (1, 1, 1, 1)
     background.inputs["Strength"].default_value = WORLD

@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
-import struct
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import unquote
 
 import bpy
 import numpy as np
 
-from . import ASSET_SUFFIXES
+from . import ASSET_SUFFIXES, gltf
 from .clips import Clip, find_clips, play, rest_pose
+from .gltf import LARGEST
 from .sequence import InputError, Normalisation
-
-LARGEST = 1e6  # coordinates beyond this are damage, not size: single precision gives out
 
 
 @dataclass
@@ -68,7 +65,7 @@ def open_asset(path: Path) -> Asset:
         raise InputError(f"{path}: files of this kind cannot be opened; give one of {', '.join(ASSET_SUFFIXES)}.")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if suffix in (".glb", ".gltf"):
-        _check_gltf(path)
+        gltf.check(path)
     empty()
     try:
         _load(path, suffix)
@@ -86,12 +83,24 @@ def open_asset(path: Path) -> Asset:
     return Asset(path, digest, find_clips(imported), warnings, rest)
 
 
+class _KeepRestPose:
+    """The glTF importer ends by playing the first animation, whose pose then overwrites the rest pose."""
+
+    def gather_import_animations(self, animations, options, gltf) -> None:
+        options.restore_first_anim = False
+
+
 def _load(path: Path, suffix: str) -> None:
     name = str(path.resolve())
     if suffix == ".blend":
         bpy.ops.wm.open_mainfile(filepath=name, load_ui=False, use_scripts=False)
     elif suffix in (".glb", ".gltf"):
-        bpy.ops.import_scene.gltf(filepath=name)
+        importer = sys.modules["io_scene_gltf2"]
+        importer.glTF2ImportUserExtension = _KeepRestPose  # where the importer looks for its extensions
+        try:
+            bpy.ops.import_scene.gltf(filepath=name)
+        finally:
+            del importer.glTF2ImportUserExtension
     elif suffix == ".fbx" and hasattr(bpy.types, "WM_OT_fbx_import"):
         bpy.ops.wm.fbx_import(filepath=name)
     elif suffix == ".fbx":
@@ -100,41 +109,6 @@ def _load(path: Path, suffix: str) -> None:
         bpy.ops.wm.obj_import(filepath=name)
     else:
         bpy.ops.wm.usd_import(filepath=name, import_all_materials=True)
-
-
-def _check_gltf(path: Path) -> None:
-    """What the importer would find out late, or not at all: a cut file, files beside it that are missing or
-    lie elsewhere."""
-    data = path.read_bytes()
-    try:
-        if path.suffix.lower() == ".glb":
-            magic, version, length, chunk = struct.unpack_from("<4sIII", data)
-            if magic != b"glTF" or version != 2:
-                raise ValueError("not a binary glTF 2.0 file")
-            if length > len(data):
-                raise ValueError(f"cut off after {len(data)} of {length} bytes")
-            data = data[20 : 20 + chunk]
-        document = json.loads(data)
-        used = [(kind, x.get("uri")) for kind in ("buffers", "images") for x in document.get(kind, [])]
-    except (ValueError, struct.error, AttributeError, TypeError) as e:
-        raise InputError(f"{path}: it is damaged ({e}); export it again.") from None
-    for kind, uri in used:
-        if not uri or uri.startswith("data:"):
-            continue
-        file = _inside(path, unquote(uri))
-        if kind == "buffers" and not file.is_file():
-            raise InputError(f"{path}: its data file {uri} is missing; put it beside it.")
-
-
-def _inside(path: Path, reference: str) -> Path:
-    """Where a file named by the asset lies; InputError if that is not below the asset's folder."""
-    folder = path.resolve().parent
-    file = (folder / reference).resolve()
-    if not file.is_relative_to(folder):
-        raise InputError(
-            f"{path}: it refers to {reference}, outside of its own folder; pack it into the file or copy it beside it."
-        )
-    return file
 
 
 def _hide_bone_shapes() -> None:
@@ -168,7 +142,7 @@ def _check_textures(path: Path) -> list[str]:
         if image.source not in ("FILE", "SEQUENCE", "MOVIE", "TILED"):
             continue
         if not image.packed_file and image.filepath:
-            _inside(path, bpy.path.abspath(image.filepath, library=image.library))
+            gltf.inside(path, bpy.path.abspath(image.filepath, library=image.library))
         if image.users and not (image.has_data or image.size[0]):  # size[0] makes Blender try to load it
             warnings.append(f"{path}: the texture {image.name} is missing or damaged; it is rendered light grey.")
             image.source = "GENERATED"

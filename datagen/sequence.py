@@ -202,7 +202,7 @@ def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None)
     """Single-part ZIP EXR: Z (float), flow_next/flow_prev (half), and R G B A (half, scene-linear
     premultiplied) where `combined` (H,W,4) is given. Infinite depth is written as 1e10, as Blender does."""
     half = np.float16
-    channels = {"Z": np.where(np.isfinite(passes.depth), passes.depth, 1e10).astype(np.float32)}
+    channels = {"Z": np.where(np.isinf(passes.depth), 1e10, passes.depth).astype(np.float32)}
     for name, flow in (("flow_next", passes.flow_next), ("flow_prev", passes.flow_prev)):
         for i, axis in enumerate("xy"):
             channels[f"{name}.{axis}"] = np.ascontiguousarray(flow[..., i], half)

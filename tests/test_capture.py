@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+import bpy
+import numpy as np
+import pytest
+
+from timesplat.datagen import capture as cp
+from timesplat.datagen import rigs, scene
+from timesplat.datagen.rigs import Shot
+from timesplat.datagen.sequence import InputError, Normalisation
+
+STEP, TURN = np.array([0.11, 0.0, 0.06]), np.radians(6)  # of the plane, per frame
+NORM = Normalisation(1.6, (0.3, 0.1, -0.2))
+
+
+@pytest.fixture
+def plane():
+    """A checkered 2x2 plane in the XZ plane, facing the front, that moves and turns about its normal."""
+    scene.empty()
+    bpy.ops.mesh.primitive_plane_add(size=2, rotation=(np.pi / 2, 0, 0))
+    ob = bpy.context.object
+    ob.data.transform(ob.matrix_world)
+    ob.rotation_euler = (0, 0, 0)
+    material = bpy.data.materials.new("checker")
+    nodes = material.node_tree.nodes
+    checker = nodes.new("ShaderNodeTexChecker")
+    uv = nodes.new("ShaderNodeTexCoord").outputs["UV"]
+    material.node_tree.links.new(uv, checker.inputs["Vector"])
+    material.node_tree.links.new(checker.outputs[0], nodes["Principled BSDF"].inputs["Base Color"])
+    ob.data.materials.append(material)
+    for frame in range(0, 11):
+        ob.location = STEP * frame
+        ob.rotation_euler = (0, TURN * frame, 0)
+        ob.keyframe_insert("location", frame=frame)
+        ob.keyframe_insert("rotation_euler", frame=frame)
+    return ob
+
+
+def about_y(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def expected(view, frame, width, height, ahead):
+    """Depth, and motion to the frame `frame + ahead`, of the plane through each pixel's centre, by hand."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    ray = np.stack([(x - view.cx) / view.fx, -(y - view.cy) / view.fy, -np.ones_like(x)], -1)
+    c2w = NORM.to_world(view.c2w)
+    R, o = c2w[:3, :3], c2w[:3, 3]
+    d = ray @ R.T
+    z = -o[1] / d[..., 1]  # the plane is y = 0
+    p = o + z[..., None] * d
+    local = (p - STEP * frame) @ about_y(TURN * frame)
+    hit = np.abs(local[..., [0, 2]]).max(-1) < 1
+    q = local @ about_y(TURN * (frame + ahead)).T + STEP * (frame + ahead)
+    c = (q - o) @ R
+    there = np.stack([view.cx - view.fx * c[..., 0] / c[..., 2], view.cy + view.fy * c[..., 1] / c[..., 2]], -1)
+    return z / NORM.scale, there - np.stack([x, y], -1), hit
+
+
+def inside(mask):
+    """The pixels whose neighbours up to two steps away are in the mask as well: the pixel filter reaches there."""
+    out = mask.copy()
+    for axis in (0, 1):
+        out = np.all([np.roll(out, step, axis) for step in range(-2, 3)], 0)
+    out[:2], out[-2:], out[:, :2], out[:, -2:] = False, False, False, False
+    return out
+
+
+def on_white(rgba):
+    alpha = rgba[..., 3:] / 255
+    return rgba[..., :3] * alpha + 255 * (1 - alpha)
+
+
+def test_depth_and_motion_are_those_computed_by_hand(plane, tmp_path):
+    frames = [3, 4, 5, 5]  # scene frames; the last one repeats, as in a padded clip
+    poses = [rigs.spherical(10, 5, 2.2), rigs.spherical(-35, 25, 2.6), rigs.spherical(40, -20, 2.4)]
+    shots = [Shot(i, "moving", "r", poses[i % 3], 55 - 5 * i) for i in range(4)]
+    shots += [Shot(i, "still", "r", poses[1], 60) for i in range(4)]
+    width, height = 45, 31
+    seq = cp.capture(shots, tmp_path / "s", frames=frames, normalisation=NORM, size=(width, height), samples=16)
+    assert (seq.width, seq.height, seq.frame_start, seq.frame_end, len(seq.views)) == (45, 31, 0, 3, 8)
+    for i, v in enumerate(seq.views):
+        p, rgba = seq.load_passes(i), seq.load_image(i)
+        ahead, before = frames[min(v.frame + 1, 3)] - frames[v.frame], frames[v.frame - 1] - frames[v.frame]
+        ahead = ahead if v.frame < 3 else 1  # beyond the clip: what the scene does
+        before = before if v.frame > 0 else -1
+        z, flow_next, hit = expected(v, frames[v.frame], width, height, ahead)
+        _, flow_prev, _ = expected(v, frames[v.frame], width, height, before)
+        body = inside(hit)
+        assert body.sum() > 150
+        assert np.abs(p.flow_next - flow_next)[body].max() < 0.05
+        assert np.abs(p.flow_prev - flow_prev)[body].max() < 0.05
+        assert (np.abs(flow_next[body]).max() > 1) == (ahead != 0)
+        # the depth sample lies somewhere in the pixel's filter: within a pixel and a half of its centre
+        slope = np.abs(np.gradient(z)).sum(0)
+        assert (np.abs(p.depth - z)[body] <= 1.5 * slope[body] + 1e-4).all()
+        assert np.abs((p.depth - z)[body].mean()) < 0.1 * slope[body].mean() + 1e-4  # and has no bias
+        far = inside(~hit)
+        assert np.isinf(p.depth[far]).all() and (rgba[far] == 0).all() and (rgba[body][:, 3] == 255).all()
+
+
+def test_silhouette_depth_is_never_a_mixture(plane, tmp_path):
+    shots = [Shot(0, "a", "r", rigs.spherical(20, 10, 2.6))]
+    seq = cp.capture(shots, tmp_path / "s", frames=[2], normalisation=NORM, size=40, samples=16)
+    depth, alpha = seq.load_passes(0).depth, seq.load_image(0)[..., 3]
+    edge = (alpha > 0) & (alpha < 255)
+    z = expected(seq.views[0], 2, 40, 40, 1)[0]
+    assert edge.sum() > 30
+    assert (np.isinf(depth[edge]) | (np.abs(depth - z)[edge] < 0.1)).all()
+
+
+def test_all_cameras_of_a_frame_at_once_are_each_alone(plane, tmp_path):
+    shots = rigs.default_rig([0])
+    options = {"frames": [4], "normalisation": NORM, "size": 32, "samples": 64}
+    together = cp.capture(shots, tmp_path / "all", **options)
+    first = cp.capture(shots[:1], tmp_path / "one", **options)
+    assert np.array_equal(together.load_image(0), first.load_image(0))  # view 0: to the bit
+    for i in (3, 5):
+        alone = cp.capture(shots[i : i + 1], tmp_path / f"{i}", **options)
+        a, b = on_white(together.load_image(i)), on_white(alone.load_image(0))
+        assert np.abs(a - b).mean() < 1  # the other views have noise of their own: 0.5, it falls with samples
+        p, q = together.load_passes(i), alone.load_passes(0)
+        body = inside(np.isfinite(p.depth) & np.isfinite(q.depth))
+        assert np.abs(p.flow_next - q.flow_next)[body].max(initial=0) < 0.05
+
+
+def test_the_same_seed_gives_the_same_pictures(plane, tmp_path):
+    options = {"frames": [4, 5], "normalisation": NORM, "size": 24, "samples": 2, "passes": False}
+    shots = rigs.alternating([0, 1])
+    a, b, c = (cp.capture(shots, tmp_path / str(i), seed=i // 2, **options) for i in range(3))
+    assert all(np.array_equal(a.load_image(i), b.load_image(i)) for i in (0, 1))
+    assert not np.array_equal(a.load_image(0), c.load_image(0))
+
+
+def test_colour_is_srgb_and_straight(tmp_path):
+    scene.empty()
+    bpy.ops.mesh.primitive_plane_add(size=1.3, rotation=(np.pi / 2, 0, 0.2))
+    material = bpy.data.materials.new("glow")
+    tree = material.node_tree
+    tree.nodes.clear()
+    glow, end = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    glow.inputs[0].default_value = (1.0, 0.2, 0.01, 1)
+    tree.links.new(glow.outputs[0], end.inputs[0])
+    bpy.context.object.data.materials.append(material)
+    bpy.context.scene.view_settings.exposure = 2  # an artist's display settings must not matter
+    seq = cp.capture(
+        rigs.canonical([0])[:1], tmp_path / "s", frames=[1], normalisation=Normalisation(), size=32, linear=True
+    )
+    rgba = seq.load_image(0)
+    want = [255, round(255 * (1.055 * 0.2 ** (1 / 2.4) - 0.055)), round(255 * (1.055 * 0.01 ** (1 / 2.4) - 0.055))]
+    covered = rgba[..., 3] > 0
+    assert ((rgba[..., 3] > 0) & (rgba[..., 3] < 255)).any()
+    assert np.abs(rgba[covered][:, :3].astype(int) - want).max() <= 1  # at the edge as well
+    import OpenEXR
+
+    with OpenEXR.File(str(seq.root / seq.views[0].passes), separate_channels=True) as f:
+        green, alpha = (f.channels()[c].pixels.astype(float) for c in "GA")
+    assert np.allclose(green, 0.2 * alpha, atol=1e-3)  # premultiplied, scene-linear
+
+
+# ---------------------------------------------------------------- the artist's scene
+
+
+def state():
+    """All that an artist could notice, as plain data."""
+    s, found = bpy.context.scene, {}
+    groups = {
+        "scene": s,
+        "render": s.render,
+        "image": s.render.image_settings,
+        "cycles": s.cycles,
+        "view": s.view_settings,
+        "layer": bpy.context.view_layer,
+    }
+    for i, v in enumerate(s.render.views):
+        groups[f"view {i}"] = v
+    for name, data in groups.items():
+        for p in data.bl_rna.properties:
+            if p.type not in ("POINTER", "COLLECTION") and p.identifier != "use_nodes":  # deprecated: warns
+                found[name, p.identifier] = str(getattr(data, p.identifier))
+    for name in ("scenes", "objects", "cameras", "lights", "worlds", "meshes", "actions", "collections", "images"):
+        found[name] = [x.name for x in getattr(bpy.data, name)]
+    found["images"] = [x for x in found["images"] if x != "Render Result"]  # every render in Blender makes it
+    for ob in bpy.data.objects:
+        found[ob.name] = (str(ob.matrix_world), str(ob.location), ob.hide_render, ob.select_get(), ob.users)
+    found["links"] = (s.camera, s.world, bpy.context.view_layer.objects.active, [o.name for o in s.objects])
+    return found
+
+
+@pytest.mark.parametrize("lighting", [True, False])
+@pytest.mark.parametrize("fail", [False, True])
+def test_the_scene_comes_back_exactly(plane, tmp_path, lighting, fail):
+    bpy.ops.mesh.primitive_cube_add(location=(3, 0, 0))
+    cube = bpy.context.object
+    bpy.ops.object.light_add(type="SUN")
+    bpy.ops.object.camera_add()
+    s = bpy.context.scene
+    s.camera = bpy.context.object
+    s.world = bpy.data.worlds.new("mine")
+    s.render.engine, s.render.resolution_x, s.render.filepath = "BLENDER_WORKBENCH", 123, "/tmp/mine"
+    s.frame_set(7, subframe=0.25)
+    cube.select_set(True)
+    before = state()
+
+    class StopError(Exception):
+        pass
+
+    def progress(done, total):
+        if fail:
+            raise StopError
+
+    def go():
+        return cp.capture(
+            rigs.alternating([0, 1]),
+            tmp_path / "s",
+            frames=[4, 5],
+            normalisation=NORM,
+            size=24,
+            samples=1,
+            lighting=lighting,
+            objects=[plane] if lighting else None,
+            progress=progress,
+        )
+
+    if fail:
+        with pytest.raises(StopError):
+            go()
+        assert list(tmp_path.iterdir()) == []
+    else:
+        go()
+    after = state()
+    assert {k: (before[k], after.get(k)) for k in before if before[k] != after.get(k)} == {}
+    assert before.keys() == after.keys()
+
+
+def test_only_the_objects_given_are_seen(plane, tmp_path):
+    bpy.ops.mesh.primitive_cube_add(size=40, location=(0, 30, 0))
+    wall = bpy.context.object
+    options = {"frames": [0], "normalisation": NORM, "size": 24, "samples": 1, "passes": False}
+    shot = rigs.canonical([0])[:1]
+    both = cp.capture(shot, tmp_path / "a", **options).load_image(0)
+    alone = cp.capture(shot, tmp_path / "b", objects=[plane], **options).load_image(0)
+    wall.hide_render = True
+    hidden = cp.capture(shot, tmp_path / "c", **options).load_image(0)
+    assert (both[..., 3] == 255).all() and (alone[..., 3] == 0).any()
+    assert np.array_equal(hidden, alone)
+
+
+def test_the_scene_s_own_lights(plane, tmp_path):
+    options = {"frames": [0], "normalisation": NORM, "size": 24, "samples": 1, "passes": False}
+    shot = rigs.canonical([0])[:1]
+    dark = cp.capture(shot, tmp_path / "a", lighting=False, **options).load_image(0)
+    bpy.ops.object.light_add(type="SUN", rotation=(np.pi / 2, 0, 0))
+    lit = cp.capture(shot, tmp_path / "b", lighting=False, **options).load_image(0)
+    assert dark[..., :3].max() < 10 and lit[..., :3].max() > 100
+    a = cp.capture(shot, tmp_path / "c", **options).load_image(0)
+    bpy.context.object.data.energy = 1000
+    assert np.array_equal(a, cp.capture(shot, tmp_path / "d", **options).load_image(0))
+
+
+def test_nothing_to_render_is_said(plane, tmp_path):
+    with pytest.raises(InputError, match=r"no camera.*;.*\.$"):
+        cp.capture([], tmp_path / "s", frames=[1], normalisation=NORM)
