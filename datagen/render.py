@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -213,6 +214,17 @@ def _finished(asset: str, folder: Path, settings: Settings) -> list[Path]:
     return list(found) if found and len(found) == max(found.values()) else []
 
 
+def _sweep(job: dict) -> None:
+    """Removes what a killed child left half-written: `write_sequence` works in a hidden folder."""
+    if "folder" in job:
+        folder = Path(job["folder"])
+        left = folder.parent.glob(f".{folder.name}.*")
+    else:
+        left = Path(job["out"]).glob(".*")
+    for half in left:
+        shutil.rmtree(half, ignore_errors=True)
+
+
 def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
     """Runs one job in a child process and passes on its messages; its death is a message too."""
     with tempfile.TemporaryDirectory(prefix="timesplat-") as tmp:
@@ -232,6 +244,7 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
             process.kill()
             process.wait()
             running.discard(process)
+            _sweep(job)
         if code and not said_error:
             reason = f"signal {-code}" if code < 0 else f"exit code {code}"
             lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+import argparse
+import json
+import os
+import sys
+from dataclasses import replace
+
+import bpy
+import numpy as np
+import pytest
+
+from timesplat.datagen import render, scene
+from timesplat.datagen.render import Settings, render_assets, render_shots
+from timesplat.datagen.sequence import InputError, read_sequence
+
+SMALL = Settings(rig="alternating", frames=4, size=24, samples=1)
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory):
+    """A folder with a moving cube of two clips, a cube that stands still, and a file that is cut."""
+    folder = tmp_path_factory.mktemp("assets")
+    scene.empty()
+    bpy.ops.mesh.primitive_cube_add()
+    ob = bpy.context.object
+    for name, way in (("short way", 1), ("long way", 3)):
+        for frame in (0, 10):
+            ob.location = (way * frame / 10, 0, 0)
+            ob.keyframe_insert("location", frame=frame)
+        action = ob.animation_data.action
+        track = ob.animation_data.nla_tracks.new()
+        track.name = name
+        track.strips.new(name, 0, action)
+        ob.animation_data.action = None
+    options = {"export_animation_mode": "NLA_TRACKS"}
+    bpy.ops.export_scene.gltf(filepath=str(folder / "moving.glb"), **options)
+    ob.animation_data_clear()
+    bpy.ops.export_scene.gltf(filepath=str(folder / "still.glb"), **options)
+    whole = (folder / "moving.glb").read_bytes()
+    (folder / "cut.glb").write_bytes(whole[: len(whole) // 2])
+    return folder
+
+
+def test_a_folder_of_assets(assets, tmp_path):
+    said, counts = [], []
+    folders, failures = render_assets(
+        [str(assets)], tmp_path, SMALL, jobs=2, report=said.append, progress=lambda *n: counts.append(n)
+    )
+    assert {f.relative_to(tmp_path).as_posix() for f in folders} == {"moving/long-way", "still/static"}
+    assert failures == said and len(said) == 1 and "cut.glb" in said[0] and said[0].endswith(".")
+    assert counts[0] == (0, 3, 0) and counts[-1] == (3, 3, 5)
+    seq = read_sequence(tmp_path / "moving" / "long-way")
+    assert [v.camera for v in seq.views] == ["front", "left", "back", "right"] and seq.frame_end == 3
+    p = seq.provenance
+    assert p["asset"] == "moving.glb" and len(p["sha256"]) == 64 and p["clip"] == "long way"
+    assert p["scene_frames"] == [0, 1, 2, 3] and p["blender"].startswith(str(bpy.app.version[0]))
+    assert p["settings"]["samples"] == 1
+    assert np.isfinite(seq.load_passes(0).depth).any() and seq.load_image(0)[..., 3].any()
+    still = read_sequence(tmp_path / "still" / "static")
+    assert (still.frame_start, still.frame_end, len(still.views)) == (0, 0, 1)
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_a_second_run_renders_only_what_is_missing(assets, tmp_path):
+    both = [str(assets / "moving.glb"), str(assets / "still.glb")]
+    settings = replace(SMALL, clip="all", passes=False)
+    first, _ = render_assets(both, tmp_path, settings)
+    assert len(first) == 3
+    times = {f: (f / "transforms.json").stat().st_mtime_ns for f in first}
+    (first[0] / "images").rename(first[0] / "gone")
+    again, failures = render_assets(both, tmp_path, settings)
+    assert sorted(again) == sorted(first) and not failures
+    changed = [f for f in first if (f / "transforms.json").stat().st_mtime_ns != times[f]]
+    assert changed == [first[0]]
+    other, _ = render_assets(both[1:], tmp_path, replace(settings, samples=2))
+    assert (other[0] / "transforms.json").stat().st_mtime_ns != times[other[0]]
+
+
+def test_still_objects_displaced(assets, tmp_path):
+    settings = replace(SMALL, displace=True, rig="canonical")
+    (folder,), _ = render_assets([str(assets / "still.glb")], tmp_path, settings)
+    seq = read_sequence(folder)
+    assert seq.frame_end == 3 and len(seq.views) == 16
+    p = seq.load_passes(seq.select(camera="front", frame=1)[0])
+    flow = p.flow_next[np.isfinite(p.depth)]
+    assert np.abs(flow).max() > 0.1
+
+
+def test_shots_of_a_setup_with_targets(assets, tmp_path):
+    seen = []
+    seq = render_shots(
+        str(assets / "moving.glb"),
+        tmp_path / "here",
+        "interpolation",
+        replace(SMALL, targets=2, clip="short way"),
+        progress=lambda *n: seen.append(n),
+    )
+    assert seq.root == tmp_path / "here" and seq.provenance["clip"] == "short way"
+    assert len(seq.select(rig="interpolation")) == 4 and len(seq.select(rig="target")) == 8
+    assert seen[-1] == (12, 12)
+    with pytest.raises(InputError, match=r"no clip named x; it has .*short way"):
+        render_shots(str(assets / "moving.glb"), tmp_path / "x", "random", replace(SMALL, clip="x"))
+    with pytest.raises(InputError, match=r"cut off"):
+        render_shots(str(assets / "cut.glb"), tmp_path / "x", "random", SMALL)
+
+
+def test_the_zoo(tmp_path):
+    a, _ = render_assets(["zoo:7"], tmp_path / "a", SMALL)
+    b = render_shots("zoo:7", tmp_path / "b", "alternating", SMALL)
+    assert [f.relative_to(tmp_path).as_posix() for f in a] == ["a/zoo-000007/zoo"]
+    assert b.provenance["zoo"]["seed"] == 7
+    assert all(np.array_equal(read_sequence(a[0]).load_image(i), b.load_image(i)) for i in range(4))
+
+
+def test_two_assets_of_one_name(assets, tmp_path):
+    (tmp_path / "still.glb").write_bytes((assets / "still.glb").read_bytes())
+    both = [str(assets / "still.glb"), str(tmp_path / "still.glb")]
+    folders, failures = render_assets(both, tmp_path / "out", SMALL, report=lambda s: None)
+    assert len(folders) == 1 and len(failures) == 1 and "rename" in failures[0]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_child_that_dies_is_one_sentence(assets, tmp_path, monkeypatch):
+    dying = tmp_path / "python"
+    dying.write_text("#!/bin/sh\necho 'last words' > \"$4\"\nkill -SEGV $$\n")
+    dying.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(dying))
+    half = tmp_path / "out" / "still" / ".static.abc"
+    half.mkdir(parents=True)
+    folders, failures = render_assets([str(assets / "still.glb")], tmp_path / "out", SMALL, report=print)
+    assert not half.exists()
+    assert not folders and len(failures) == 1
+    assert "signal 11" in failures[0] and "last words" in failures[0] and "still.glb" in failures[0]
+    with pytest.raises(InputError, match="signal 11"):
+        render_shots(str(assets / "still.glb"), tmp_path / "x", "random", SMALL)
+
+
+def arguments(*words):
+    parser = argparse.ArgumentParser()
+    render.add_arguments(parser)
+    return parser.parse_args([str(w) for w in words])
+
+
+def test_the_command_line(assets, tmp_path, capsys):
+    small = ["--out", tmp_path, "--size", 24, "--samples", 1, "--frames", 2, "--rig", "random", "--no-passes"]
+    assert render.run(arguments(assets / "still.glb", *small)) == 0
+    assert render.run(arguments(assets / "still.glb", tmp_path / "no.glb", *small)) == 2
+    text = capsys.readouterr()
+    assert "1 sequences" in text.out and "1 failed" in text.out and "no such file" in text.err
+    made = json.loads((tmp_path / "still" / "static" / "transforms.json").read_text())
+    assert "exr_path" not in made["frames"][0] and made["w"] == 24
+    for wrong in (
+        small,
+        [tmp_path / "still" / "static" / "images", *small],
+        ["--zoo", "1-x", *small],
+        [assets, *small, "--size", 4],
+        [assets, *small, "--samples", 0],
+    ):
+        with pytest.raises(InputError, match=r"^[^\n]*;[^\n]*\.$"):
+            render.run(arguments(*wrong))
+
+
+def test_seeds():
+    assert render.parse_seeds("0-3, 7,9-9") == [0, 1, 2, 3, 7, 9] and render.parse_seeds(None) == []
