@@ -202,7 +202,12 @@ def evaluate(args: argparse.Namespace) -> int:
             bar.refresh()
 
         folders, failures = render_assets(
-            args.assets, args.out / "renders" / args.setup, settings, jobs=args.jobs, report=bar.write, progress=progress
+            args.assets,
+            args.out / "renders" / args.setup,
+            settings,
+            jobs=args.jobs,
+            report=bar.write,
+            progress=progress,
         )
     if not folders:
         raise InputError(f"{args.assets[0]}: nothing to evaluate; none of the assets could be rendered.")
@@ -222,7 +227,9 @@ def check_methods(text: str) -> list[str]:
 
 
 def demo_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", nargs="?", help="an animated file, or zoo:SEED (default: a procedural object no checkpoint saw)")
+    p.add_argument(
+        "asset", nargs="?", help="an animated file, or zoo:SEED (default: a procedural object no checkpoint saw)"
+    )
     p.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write (default: out/demo)")
     p.add_argument("--size", type=int, default=128, help="pixels, a multiple of 8 (default: 128)")
     p.add_argument("--samples", type=int, default=32, help="Cycles samples (default: 32)")
@@ -236,7 +243,12 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def extension_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--out", type=Path, default=Path("dist"), help="folder for the .zip (default: dist)")
+    p.add_argument(
+        "--out",
+        type=Path,
+        default=Path("dist"),
+        help="folder for the .zip, which Blender installs from disk: Preferences, Get Extensions (default: dist)",
+    )
 
 
 def extension(args: argparse.Namespace) -> int:

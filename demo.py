@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     clock = time.perf_counter()
     settings = Settings(targets=1, size=args.size, samples=args.samples)
-    with tqdm(desc="rendering", unit="image", total=0) as bar:
+    with tqdm(desc="rendering", unit="image", total=0, disable=None) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total, bar.n = total, done
@@ -72,7 +72,7 @@ def _pictures(out, held_out: Views, turntable: Views, clouds: dict[str, Gaussian
     turntable.webp: the same side by side while camera and time move."""
     few = torch.linspace(0, len(held_out) - 1, 6).round().long()
     some = torch.linspace(0, len(turntable) - 1, 7).round().long()[:6]
-    frames = [f"held out {int(round(float(t / held_out.frame_step + 0.5 * 23)))}" for t in held_out.time[few]]
+    frames = [f"held out {round(float(t / held_out.frame_step) + 11.5)}" for t in held_out.time[few]]
     around = [f"turntable {int(i)}" for i in some]
     rows = {"truth": torch.cat([held_out[few].over(), turntable[some].over()])}
     film = {"truth": turntable.over()}

@@ -89,7 +89,7 @@ class Clips:
         found = [p.parent for f in folders for p in sorted(Path(f).rglob("transforms.json"))]
         if not found:
             raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
-        self.paths = [pack(f, cache) for f in tqdm(found, desc="packing", unit="clip", leave=False)]
+        self.paths = [pack(f, cache) for f in tqdm(found, desc="packing", unit="clip", leave=False, disable=None)]
 
     def sample(self, rng: np.random.Generator, targets: int, views: int = 24) -> Sample:
         """A clip at random, `views` input views by one of SAMPLERS, and `targets` other views of any time,
@@ -113,27 +113,31 @@ CANONICAL = ("front", "left", "back", "right")
 
 
 def choose_inputs(rng, frame, camera, names: list[str], views: int) -> np.ndarray:
-    """Indices of the input views of a sample: at most `views`, in the order of time."""
+    """Indices of the input views of a sample: at most `views`, in the order of time. Of the kind's cameras
+    those are taken that have a view at the frame; all that have one where none of them does."""
     kinds = list(SAMPLERS)
     kind = kinds[rng.choice(len(kinds), p=list(SAMPLERS.values()))]
-    fixed = [names.index(c) for c in CANONICAL if c in names]
-    moving = [i for i in range(len(names)) if i not in fixed]
-    pool = {"moving": moving, "every": list(range(len(names)))}.get(kind, fixed) or list(range(len(names)))
-    start = rng.integers(len(pool))
-    out = []
+    canonical = np.isin(camera, [names.index(c) for c in CANONICAL if c in names])
+    wanted = {"moving": ~canonical, "every": np.ones_like(canonical)}.get(kind, canonical)
+    start = rng.integers(len(names))
+    found: list[int] = []
     for n, t in enumerate(np.unique(frame)):
-        if kind == "interpolation":
-            if n % 2 == 0:
-                out += [(t, pool[(start + n + k) % len(pool)]) for k in (0, 1)]
-        elif kind == "every":
-            out.append((t, pool[rng.integers(len(pool))]))
-        else:
-            out.append((t, pool[(start + n) % len(pool)]))
-    index = {(f, c): i for i, (f, c) in enumerate(zip(frame.tolist(), camera.tolist(), strict=True))}
-    found = np.array([index[k] for k in ((int(t), int(c)) for t, c in out) if k in index])
+        here = np.flatnonzero(frame == t)
+        pool = here[wanted[here]] if wanted[here].any() else here
+        pool = sorted(pool, key=lambda i: _order(names[camera[i]]))
+        turn = rng.integers(len(pool)) if kind == "every" else start + n
+        if kind != "interpolation":
+            found.append(pool[turn % len(pool)])
+        elif n % 2 == 0:
+            found += {pool[(turn + k) % len(pool)] for k in (0, 1)}
     if len(found) > views:
-        found = found[np.sort(rng.choice(len(found), views, replace=False))]
-    return found
+        found = [found[i] for i in np.sort(rng.choice(len(found), views, replace=False))]
+    return np.array(found)
+
+
+def _order(name: str) -> tuple:
+    """Canonical cameras in their cyclic order first, then the others by name."""
+    return (CANONICAL.index(name), "") if name in CANONICAL else (len(CANONICAL), name)
 
 
 def _views(f, indices: np.ndarray, step: float) -> Views:

@@ -59,7 +59,7 @@ def evaluate_folders(sequences: dict[str, Sequence], methods: list[str], out: Pa
     """Scores every method on every Sequence {name: Sequence}: its views of rig "target" are held out, all the
     others are input. Writes metrics.json and metrics.md below `out`, prints the table, returns the metrics."""
     objects: dict[str, dict[str, dict]] = {}
-    bar = tqdm(total=len(sequences) * len(methods), desc="evaluating", unit="run")
+    bar = tqdm(total=len(sequences) * len(methods), desc="evaluating", unit="run", disable=None)
     for name, seq in sequences.items():
         inputs = [i for i, v in enumerate(seq.views) if v.rig != "target"]
         objects[name] = {}

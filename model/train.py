@@ -11,6 +11,7 @@ import argparse
 import json
 import math
 import os
+import signal
 import time
 from dataclasses import replace
 
@@ -55,6 +56,7 @@ class Trainer:
         groups = [{"params": matrices, "weight_decay": 0.05}, {"params": others, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=args.rate, betas=(0.9, 0.95))
         self.step, self.seconds, self.skipped = 0, 0.0, 0
+        self.stopped = False
         self.state = args.out / "state.pt"
         args.out.mkdir(parents=True, exist_ok=True)
         if self.state.exists():
@@ -67,11 +69,23 @@ class Trainer:
         return self.step / self.args.steps
 
     def run(self) -> None:
+        """Trains to the end; an interrupt (Ctrl-C) ends it after the step at hand, with the state saved."""
+        previous = signal.signal(signal.SIGINT, lambda *_: setattr(self, "stopped", True))
+        try:
+            self._loop()
+        finally:
+            signal.signal(signal.SIGINT, previous)
+        if self.stopped:
+            raise KeyboardInterrupt
+
+    def _loop(self) -> None:
         args, start, base = self.args, time.perf_counter(), self.seconds
-        bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}<{remaining}{postfix}", desc=args.out.name)
+        bar = tqdm(
+            total=1.0, disable=None, bar_format="{l_bar}{bar}| {elapsed}<{remaining}{postfix}", desc=args.out.name
+        )
         recent: list[tuple[float, float]] = []
         shares = np.zeros(4)
-        while self.progress() < 1:
+        while self.progress() < 1 and not self.stopped:
             recent.append(self.train_step(shares))
             self.seconds = base + time.perf_counter() - start
             if self.step % 20 == 0:

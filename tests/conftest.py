@@ -72,3 +72,53 @@ def spheres():
 
     make.truth = truth
     return make
+
+
+@pytest.fixture(scope="session")
+def write_views():
+    """write_views(views, folder, targets=None) -> the Sequence of Views (24 frames) on disk; views of `targets`
+    are of rig "target"."""
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    from timesplat.datagen.sequence import Passes, Sequence, View, opengl_to_opencv, write_passes, write_sequence
+
+    def write(views, folder, targets=None):
+        height, width = views.size
+        parts = [(views, "input")] + ([(targets, "target")] if targets is not None else [])
+        seq = Sequence(width, height, 24.0, 0, 23, provenance={"asset": "spheres"})
+        data = []
+        for v, rig in parts:
+            for i in range(len(v)):
+                frame = round(float(v.time[i]) * 11.5 + 11.5)
+                c2w = opengl_to_opencv(v.c2w[i].double().numpy())
+                seq.views.append(View(frame, f"{rig}{i}", rig, c2w, *map(float, v.intrinsics[i])))
+                data.append((v, i))
+
+        def fill(root):
+            (root / "images").mkdir()
+            (root / "passes").mkdir()
+            for n, (view, (v, i)) in enumerate(zip(seq.views, data, strict=True)):
+                view.image, view.passes = f"images/{n:03d}.png", f"passes/{n:03d}.exr"
+                rgba = torch.cat([v.rgb[i], v.alpha[i][..., None]], -1)
+                Image.fromarray((rgba * 255).round().to(torch.uint8).numpy()).save(root / view.image)
+                flow = v.flow[i].numpy()
+                write_passes(root / view.passes, Passes(v.depth[i].numpy(), flow[..., :2], flow[..., 2:]))
+
+        return write_sequence(seq, folder, fill)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def sphere_folder(spheres, write_views, tmp_path_factory):
+    """A Sequence on disk: 24 alternating views of the spheres at 32x32, and 6 held-out ones."""
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    frames = list(range(0, 24, 4))
+    held_out = spheres(frames, [(rng.uniform(0, 360), rng.uniform(-30, 60)) for _ in frames], size=32)
+    folder = tmp_path_factory.mktemp("data") / "spheres" / "line"
+    write_views(spheres(list(range(24)), size=32), folder, held_out)
+    return folder

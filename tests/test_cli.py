@@ -1,0 +1,107 @@
+"""The program as people call it: help that teaches, and one sentence and exit code 2 for what cannot be used."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from timesplat.cli import COMMANDS, main
+
+
+def refused(capsys, *argv, says: str, names: str = "") -> None:
+    """The command exits with 2 and prints one line that holds `says` and `names`, no traceback."""
+    assert main([str(a) for a in argv]) == 2
+    err = capsys.readouterr().err.strip()
+    assert says in err and names in err and "Traceback" not in err
+    assert len(err.splitlines()) == 1, err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as e:
+        main([command, "--help"])
+    assert e.value.code == 0 and len(capsys.readouterr().out) > 200
+
+
+def test_help_starts_quickly_without_heavy_imports():
+    code = "import sys, timesplat.cli as c\ntry: c.main(['--help'])\nexcept SystemExit: pass\n"
+    code += "print([m for m in ('torch', 'bpy', 'numba', 'pxr') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
+    assert "timesplat demo" in out and out.strip().endswith("[]")
+
+
+def test_road_from_sequence_to_usd(sphere_folder, tmp_path, capsys):
+    ply, usd = tmp_path / "a.ply", tmp_path / "a.usdc"
+    assert main(["reconstruct", str(sphere_folder), "--out", str(ply), "--method", "lift"]) == 0
+    assert main(["export", str(ply), str(usd)]) == 0
+    assert "Gaussians" in capsys.readouterr().out and usd.stat().st_size > 10_000
+
+
+def test_missing_and_damaged_sequences(sphere_folder, tmp_path, capsys):
+    out = tmp_path / "out" / "a.ply"
+    out.parent.mkdir()
+
+    def reconstruct(folder, says, *more):
+        refused(capsys, "reconstruct", folder, "--out", out, "--method", "lift", *more, says=says, names=folder.name)
+        assert not list(out.parent.iterdir())
+
+    reconstruct(tmp_path / "nowhere", "no such file")
+    broken = tmp_path / "broken"
+    shutil.copytree(sphere_folder, broken)
+    text = (broken / "transforms.json").read_text()
+    (broken / "images" / "003.png").unlink()
+    reconstruct(broken, "003.png: the file is missing")
+    shutil.copy(sphere_folder / "images" / "003.png", broken / "images" / "003.png")
+    (broken / "images" / "004.png").write_bytes(b"\x89PNG broken")
+    reconstruct(broken, "004.png: the image cannot be read")
+    shutil.copy(sphere_folder / "images" / "004.png", broken / "images" / "004.png")
+    (broken / "passes" / "005.exr").write_bytes((broken / "passes" / "005.exr").read_bytes()[:500])
+    reconstruct(broken, "005.exr")
+    shutil.copy(sphere_folder / "passes" / "005.exr", broken / "passes" / "005.exr")
+    data = json.loads(text)
+    data["frames"][2]["transform_matrix"] = [[0.0] * 4] * 4
+    (broken / "transforms.json").write_text(json.dumps(data))
+    reconstruct(broken, "singular")
+    data["frames"][2]["transform_matrix"] = [[float("nan")] * 4] * 4
+    (broken / "transforms.json").write_text(json.dumps(data))
+    reconstruct(broken, "not a finite 4x4 matrix")
+    (broken / "transforms.json").write_text(text[: len(text) // 2])
+    reconstruct(broken, "damaged")
+    (broken / "transforms.json").write_text(text)
+    reconstruct(broken, "no rig moon", "--rig", "moon")
+
+
+def test_methods_and_checkpoints(sphere_folder, tmp_path, capsys):
+    out = tmp_path / "a.ply"
+    refused(capsys, "reconstruct", sphere_folder, "--out", out, "--method", "magic", says="no such method")
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"\x10\0\0\0\0\0\0\0{")
+    refused(
+        capsys, "reconstruct", sphere_folder, "--out", out, "--checkpoint", bad, says="not a whole", names="bad.safe"
+    )
+    refused(capsys, "evaluate", "x.glb", "--out", tmp_path / "e", "--methods", "lift,magic", says="no such method")
+    refused(capsys, "train", tmp_path / "none", "--out", tmp_path / "run", says="no Sequence in it", names="none")
+    assert not out.exists()
+
+
+def test_assets_to_export(tmp_path, capsys):
+    refused(capsys, "export", tmp_path / "no.ply", tmp_path / "a.usdc", says="no.ply")
+    cut = tmp_path / "cut.ply"
+    cut.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n1234")
+    refused(capsys, "export", cut, tmp_path / "a.usdc", says="cut.ply")
+    assert not (tmp_path / "a.usdc").exists()
+
+
+def test_files_that_no_renderer_takes(tmp_path, capsys):
+    bad = tmp_path / "bad.glb"
+    bad.write_bytes(b"glTF\x02\0\0\0 not really")
+    for asset, says in ((tmp_path / "none.glb", "none.glb"), (bad, "bad.glb"), (tmp_path / "a.txt", "a.txt")):
+        if asset.suffix == ".txt":
+            asset.write_text("hello")
+        code = main(["render", str(asset), "--out", str(tmp_path / "renders"), "--size", "32", "--samples", "1"])
+        err = capsys.readouterr().err
+        assert code == 2 and says in err and "Traceback" not in err
+    refused(capsys, "demo", bad, "--out", tmp_path / "demo", says="bad.glb")
+    assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.parent.name not in (tmp_path.name,)]

@@ -1,0 +1,105 @@
+"""Methods by name, checkpoints that are whole or refused, and what was on disk when it went wrong."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from timesplat.datagen.sequence import InputError, read_sequence
+from timesplat.model.network import Config, Network
+from timesplat.model.reconstruct import METHODS, clip_of, load_network, reconstruct, save_network
+
+TINY = Config(width=32, depth=1, heads=2, source="given")
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    torch.manual_seed(0)
+    path = tmp_path / "tiny.safetensors"
+    save_network(path, Network(TINY), {"steps": "0"})
+    return path
+
+
+def test_checkpoint_round_trip(checkpoint):
+    torch.manual_seed(0)
+    network, back = Network(TINY), load_network(checkpoint)
+    assert back.config == TINY and not back.training
+    for k, v in network.state_dict().items():
+        torch.testing.assert_close(back.state_dict()[k], v.half().float(), rtol=0, atol=0)
+    assert not list(checkpoint.parent.glob("*.tmp"))
+
+
+@pytest.mark.parametrize("keep", [0, 7, 100, 0.5, 0.999])
+def test_truncated_checkpoint_is_one_sentence(checkpoint, keep):
+    data = checkpoint.read_bytes()
+    checkpoint.write_bytes(data[: int(keep * len(data)) if isinstance(keep, float) else keep])
+    with pytest.raises(InputError, match=r"tiny\.safetensors: not a whole Timesplat checkpoint"):
+        load_network(checkpoint)
+
+
+def test_checkpoint_with_nan_or_another_shape_or_no_config(checkpoint, tmp_path):
+    tensors = load_file(checkpoint)
+    meta = {"config": json.dumps({"width": 32, "depth": 1, "heads": 2, "source": "given"})}
+    bad = dict(tensors)
+    bad["embed.weight"] = torch.full_like(bad["embed.weight"], float("nan"))
+    save_file(bad, tmp_path / "nan.safetensors", meta)
+    with pytest.raises(InputError, match="embed.weight hold NaN"):
+        load_network(tmp_path / "nan.safetensors")
+    save_file(tensors, tmp_path / "wide.safetensors", {"config": json.dumps({"width": 64, "depth": 1, "heads": 2})})
+    with pytest.raises(InputError, match="not a whole Timesplat checkpoint"):
+        load_network(tmp_path / "wide.safetensors")
+    save_file(tensors, tmp_path / "bare.safetensors")
+    with pytest.raises(InputError, match="not a whole Timesplat checkpoint"):
+        load_network(tmp_path / "bare.safetensors")
+    with pytest.raises(InputError, match="no such checkpoint"):
+        load_network(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("method", ["white", "hull", "lift"])
+def test_methods_without_a_network(sphere_folder, method):
+    seq = read_sequence(sphere_folder)
+    g = reconstruct(seq, method, range(24))
+    assert (len(g) > 500) == (method != "white")
+    assert g.alive().all()
+    assert clip_of(seq).frame_end == 23 and clip_of(seq).pixel > 0
+
+
+def test_untrained_guided_network_is_the_lift(sphere_folder, checkpoint):
+    seq = read_sequence(sphere_folder)
+    a, b = reconstruct(seq, "lift", range(24)), reconstruct(seq, "guided", range(24), checkpoint=checkpoint)
+    torch.testing.assert_close(a.xyz, b.xyz, atol=1e-6, rtol=0)
+    torch.testing.assert_close(a.opacity, b.opacity, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("method", ["guided", "sweep", "predicted", "rgb"])
+def test_shipped_checkpoints_reconstruct(sphere_folder, method):
+    g = reconstruct(read_sequence(sphere_folder), method, range(24))
+    assert len(g) > 500
+    assert all(torch.isfinite(getattr(g, k)).all() for k in ("xyz", "velocity", "sigma_t", "scale", "rotation", "rgb"))
+
+
+def test_rgb_methods_read_no_passes(sphere_folder, tmp_path):
+    import shutil
+
+    folder = tmp_path / "bare"
+    shutil.copytree(sphere_folder, folder)
+    shutil.rmtree(folder / "passes")
+    text = json.loads((folder / "transforms.json").read_text())
+    for f in text["frames"]:
+        del f["exr_path"]
+    (folder / "transforms.json").write_text(json.dumps(text))
+    seq = read_sequence(folder)
+    assert len(reconstruct(seq, "rgb", range(24))) > 500
+    with pytest.raises(InputError, match="has no depth pass"):
+        reconstruct(seq, "lift", range(24))
+
+
+def test_unknown_method_and_empty_views(sphere_folder, spheres, write_views, tmp_path):
+    with pytest.raises(InputError, match="no such method"):
+        reconstruct(read_sequence(sphere_folder), "magic")
+    views = spheres([0], size=16)
+    views.alpha = torch.zeros_like(views.alpha)
+    with pytest.raises(InputError, match="no view shows the object"):
+        reconstruct(write_views(views, tmp_path / "empty"), "lift")
+    assert set(METHODS) >= {"white", "hull", "lift", "guided", "rgb", "sweep", "predicted"}
