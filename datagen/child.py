@@ -39,6 +39,8 @@ def run_job(job: dict, say: Callable[[dict], None]) -> None:
         provenance["sha256"] = opened.sha256
     for warning in opened.warnings:
         say({"warning": warning})
+    if settings.device == "GPU":
+        use_gpu()
     clips = choose(opened, settings)
     provenance |= {"settings": asdict(settings), "clips": len(clips), "warnings": opened.warnings}
     for slug, clip in _slugs(clips).items():
@@ -82,6 +84,24 @@ def run_job(job: dict, say: Callable[[dict], None]) -> None:
             progress=progress,
         )
         say({"written": str(folder)})
+
+
+def use_gpu() -> None:
+    """Turns on the graphics cards that Cycles finds; the session's preferences are the factory's."""
+    import bpy
+
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for kind in ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI"):
+        try:
+            devices = [d for d in preferences.get_devices_for_type(kind) if d.type == kind]
+        except (ValueError, TypeError):  # not known to this build
+            continue
+        if devices:
+            preferences.compute_device_type = kind
+            for device in devices:
+                device.use = True
+            return
+    raise InputError("--device GPU: Cycles finds no graphics card here; render with --device CPU.")
 
 
 def choose(opened, settings: Settings) -> list:

@@ -160,5 +160,14 @@ def test_the_command_line(assets, tmp_path, capsys):
             render.run(arguments(*wrong))
 
 
+def test_no_graphics_card_is_said(assets, tmp_path):
+    try:
+        seq = render_shots(str(assets / "still.glb"), tmp_path / "x", "random", replace(SMALL, device="GPU"))
+    except InputError as e:
+        assert "no graphics card" in str(e) and "--device CPU" in str(e)
+    else:
+        assert seq.load_image(0)[..., 3].any()
+
+
 def test_seeds():
     assert render.parse_seeds("0-3, 7,9-9") == [0, 1, 2, 3, 7, 9] and render.parse_seeds(None) == []
