@@ -131,9 +131,7 @@ def default_rig(frames: Sequence[int], seed: int = 0) -> list[Shot]:
 
 def turntable(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     """For showing: one camera that goes once around the object over the clip, 20 degrees above it."""
-    return [
-        Shot(f, "turntable", "turntable", spherical(360 * i / len(frames), 20)) for i, f in enumerate(frames)
-    ]
+    return [Shot(f, "turntable", "turntable", spherical(360 * i / len(frames), 20)) for i, f in enumerate(frames)]
 
 
 def demo_rig(frames: Sequence[int], seed: int = 0) -> list[Shot]:

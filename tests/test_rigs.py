@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from timesplat.datagen import rigs
 
 FRAMES = list(range(24))

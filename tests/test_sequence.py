@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
+
 from timesplat.datagen import pixels, rigs
 from timesplat.datagen import sequence as sq
 from timesplat.datagen.sequence import InputError, Normalisation, Passes, Sequence, View
