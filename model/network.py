@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from .gaussians import Gaussians4D, isoclinic_rotation, kinematic_from_covariance
 from .lift import FEATURES, Geometry
@@ -117,7 +116,7 @@ class Network(nn.Module):
         if c.free:
             x = torch.cat([x, self.free_tokens])
         for block in self.blocks:
-            x = checkpoint(block, x, use_reentrant=False) if self.recompute else block(x)
+            x = _recomputed(block, x) if self.recompute else block(x)
         x = self.norm_out(x)
         g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.outputs))  # (T, p², outputs)
 
@@ -203,6 +202,13 @@ class Network(nn.Module):
             rgb=base.rgb + 0.5 * torch.tanh(g[..., 4:7]),
             opacity=torch.sigmoid(torch.logit(base.opacity, 1e-4) + 4 * torch.tanh(0.5 * g[..., -1])),
         )
+
+
+def _recomputed(block: Block, x: Tensor) -> Tensor:
+    """block(x) whose activations are computed anew in the backward pass (gradient checkpointing)."""
+    from torch.utils.checkpoint import checkpoint  # imports a good part of torch's compiler: a second
+
+    return checkpoint(block, x, use_reentrant=False)
 
 
 _IDENTITY = torch.tensor([1.0, 0, 0, 0])

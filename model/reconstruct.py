@@ -116,8 +116,7 @@ def load_network(path: Path, device: str = "cpu"):
         with safe_open(path, "pt") as f:
             config = Config(**json.loads(f.metadata()["config"]))
             tensors = {k: f.get_tensor(k).float() for k in f.keys()}  # noqa: SIM118
-        with torch.device("meta"):
-            network = Network(config)
+        network = Network(config)
         network.load_state_dict(tensors, assign=True)
     except Exception as e:
         raise InputError(f"{path}: not a whole Timesplat checkpoint ({e}); copy or train it again.") from None
