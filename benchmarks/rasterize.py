@@ -22,6 +22,7 @@ import sys
 import time
 
 import torch
+
 from timesplat.model.gaussians import rotation_matrix
 from timesplat.model.rasterize import rasterize
 

@@ -38,6 +38,9 @@ class Geometry:
     slack: Tensor  # (V,H,W) how far along its ray the network may move it, normalised units
     features: Tensor  # (V,H,W,FEATURES) extra input channels, zero where not valid
 
+    def to(self, device) -> Geometry:
+        return Geometry(*(x.to(device) for x in vars(self).values()))
+
 
 def lift(views: Views) -> Gaussians4D:
     """Views with depth and flow -> (M,) Gaussians."""

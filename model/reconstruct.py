@@ -74,9 +74,7 @@ def reconstruct_views(views: Views, method: str, device: str = "cpu", checkpoint
     method = RGB if method == "rgb" else method
     network = load_network(checkpoint or CHECKPOINTS / f"{method}.safetensors", device)
     geometry = geometry_for(network.config.source, views)
-    if geometry is not None:
-        geometry = type(geometry)(*(x.to(device) for x in vars(geometry).values()))
-    return network(views.to(device), geometry).to("cpu")
+    return network(views.to(device), geometry and geometry.to(device)).to("cpu")
 
 
 def geometry_for(source: str, views: Views):

@@ -147,29 +147,33 @@ class Trainer:
     def sample_loss(self, sample: Sample, rng: np.random.Generator):
         """-> loss, PSNR of the target views over white, and the times at which stages ended."""
         args, network = self.args, self.network
-        inputs, targets = sample.inputs, sample.targets
-        geometry = geometry_for(network.config.source, inputs)
-        truth = lift_geometry(inputs) if args.geometric and network.config.source != "given" else None
+        geometry = geometry_for(network.config.source, sample.inputs)
+        truth = None
+        if args.geometric and network.config.source != "given":
+            truth = [x.to(args.device) for x in self.pixel_truth(sample.inputs, geometry)]
+        inputs, targets = sample.inputs.to(args.device), sample.targets.to(args.device)
+        geometry = geometry and geometry.to(args.device)
         clock = [time.perf_counter()]
         with torch.autocast(args.device.split(":")[0], torch.bfloat16, enabled=args.bf16):
             g = network(inputs, geometry)
         clock.append(time.perf_counter())
-        background = torch.tensor(rng.uniform(0, 1, 3) if rng.random() < 0.5 else [1.0] * 3, dtype=torch.float32)
+        background = torch.tensor(rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.ones(3)).float().to(args.device)
         height, width = targets.size
         rgb, alpha = render(g, targets.c2w, targets.intrinsics, targets.time, width, height, background=background)
         loss = photometric(rgb, alpha, targets, background)
         if truth is not None:
             weight = args.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
-            loss = loss + weight * geometric(g, *self.pixel_truth(inputs, geometry, truth))
+            loss = loss + weight * geometric(g, *truth)
         clock.append(time.perf_counter())
         with torch.no_grad():
             mse = (rgb - targets.over(background)).square().mean((1, 2, 3)).clamp_min(1e-10)
             score = float((-10 * torch.log10(mse)).mean())
         return loss, score, clock
 
-    def pixel_truth(self, inputs, geometry, truth) -> tuple[torch.Tensor, Gaussians4D, torch.Tensor]:
+    def pixel_truth(self, inputs, geometry) -> tuple[torch.Tensor, Gaussians4D, torch.Tensor]:
         """For each of the network's Gaussians: the time of its view, what the lift of the renderer's depth says
         of its pixel, and whether that is known."""
+        truth = lift_geometry(inputs)
         if geometry is not None:
             owner = geometry.owner
         else:
@@ -200,7 +204,7 @@ class Trainer:
 
     def resume(self) -> None:
         try:
-            state = torch.load(self.state, weights_only=True)
+            state = torch.load(self.state, map_location=self.args.device, weights_only=True)
             self.network.load_state_dict(state["network"])
             self.average = state["average"]
             self.optimiser.load_state_dict(state["optimiser"])

@@ -78,7 +78,6 @@ def spheres():
 def write_views():
     """write_views(views, folder, targets=None) -> the Sequence of Views (24 frames) on disk; views of `targets`
     are of rig "target"."""
-    import numpy as np
     import torch
     from PIL import Image
 

@@ -11,6 +11,7 @@ import math
 
 import pytest
 import torch
+
 from timesplat.model.gaussians import Gaussians4D, rotation_matrix
 from timesplat.model.rasterize import rasterize, render
 
