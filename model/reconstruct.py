@@ -12,7 +12,7 @@ import torch
 from ..datagen.sequence import InputError, Sequence
 from .asset import Clip, pixel_size
 from .gaussians import Gaussians4D
-from .views import Views, load_views
+from .views import Views, load_views, pad_to_multiple
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
 # What each method needs: depth and motion vectors, or pictures with alpha alone.
@@ -73,6 +73,7 @@ def reconstruct_views(views: Views, method: str, device: str = "cpu", checkpoint
         return lift(views)
     method = RGB if method == "rgb" else method
     network = load_network(checkpoint or CHECKPOINTS / f"{method}.safetensors", device)
+    views = pad_to_multiple(views, network.config.patch)
     geometry = geometry_for(network.config.source, views)
     return network(views.to(device), geometry and geometry.to(device)).to("cpu")
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -64,6 +64,27 @@ def load_views(seq: Sequence, indices, passes: bool = False) -> Views:
         views.depth = torch.from_numpy(np.stack([x.depth for x in p]))
         views.flow = torch.from_numpy(np.stack([np.concatenate([x.flow_next, x.flow_prev], -1) for x in p]))
     return views
+
+
+def pad_to_multiple(views: Views, multiple: int) -> Views:
+    """The views with empty pixels added on the right and below, so that both sides are multiples; cameras and
+    what they see stay as they are."""
+    height, width = views.size
+    down, right = -height % multiple, -width % multiple
+    if not down and not right:
+        return views
+
+    def pad(x: Tensor | None, value: float = 0.0) -> Tensor | None:
+        sides = (0, 0) * (x.ndim - 3) + (0, right, 0, down) if x is not None else None
+        return None if x is None else torch.nn.functional.pad(x, sides, value=value)
+
+    return replace(
+        views,
+        rgb=pad(views.rgb),
+        alpha=pad(views.alpha),
+        depth=pad(views.depth, torch.inf),
+        flow=pad(views.flow),
+    )
 
 
 def camera_rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
