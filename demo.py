@@ -12,7 +12,7 @@ from tqdm import tqdm
 from .cli import save_blend
 from .datagen.render import Settings, render_shots
 from .model.asset import write_ply
-from .model.evaluate import collect, draw, evaluate_method, table, write_metrics
+from .model.evaluate import collect, draw, evaluate_method, table, warm_up, write_metrics
 from .model.gaussians import Gaussians4D
 from .model.pictures import grid, video
 from .model.reconstruct import clip_of
@@ -42,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     inputs = [i for i, v in enumerate(seq.views) if v.rig not in ("target", "turntable")]
     print(f"{len(inputs)} input views, {len(targets)} held-out views, {len(turn)} turntable views")
 
+    warm_up(seq, inputs, METHODS)
     rows, clouds = {}, {}
     for method in METHODS:
         rows[method], clouds[method] = evaluate_method(seq, method, inputs, targets)

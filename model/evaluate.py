@@ -55,6 +55,14 @@ def evaluate_method(seq: Sequence, method: str, inputs, targets, checkpoint: Pat
     return row | {"frames": frames}, kept
 
 
+def warm_up(seq: Sequence, inputs, methods: list[str]) -> None:
+    """Runs every method once on two views, so that no timing holds the compilation of kernels (about fifteen
+    seconds, the first time on a machine) or imports."""
+    with torch.inference_mode():
+        for method in methods:
+            reconstruct_views(load_views(seq, inputs[:2], passes=method in NEEDS_PASSES), method)
+
+
 def evaluate_folders(sequences: dict[str, Sequence], methods: list[str], out: Path, checkpoint: Path | None = None):
     """Scores every method on every Sequence {name: Sequence}: its views of rig "target" are held out, all the
     others are input. Writes metrics.json and metrics.md below `out`, prints the table, returns the metrics."""
@@ -62,6 +70,8 @@ def evaluate_folders(sequences: dict[str, Sequence], methods: list[str], out: Pa
     bar = tqdm(total=len(sequences) * len(methods), desc="evaluating", unit="run", disable=None)
     for name, seq in sequences.items():
         inputs = [i for i, v in enumerate(seq.views) if v.rig != "target"]
+        if not objects and checkpoint is None:
+            warm_up(seq, inputs, methods)
         objects[name] = {}
         for method in methods:
             bar.set_postfix_str(f"{name} {method}")

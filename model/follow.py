@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .threads import each, parts
 from .views import Views
 
 GRID = 32  # voxels along [-EXTENT, EXTENT]
@@ -64,9 +65,11 @@ def follow(views: Views, points: Points, seen: Tensor) -> tuple[Tensor, Tensor, 
     arrays = [np.ascontiguousarray(x.numpy(), np.float32) for x in arrays]
     settings = np.array([TOLERANCE, DRIFT, LONGEST, FRONTAL, HANDOVER, STRAIGHT], np.float32)
     order = np.argsort(arrays[4], kind="stable")
-    pieces, count, summary = _tracks(
-        points.view.numpy(), *arrays, field.numpy(), order, np.float32(-last), np.float32(last), settings, PIECES
-    )
+    n = len(points.view)
+    pieces = np.zeros((n, PIECES, 8), np.float32)
+    count, summary = np.zeros(n, np.int64), np.zeros((n, 4), np.float32)
+    known = (points.view.numpy(), *arrays, field.numpy(), order, np.float32(-last), np.float32(last), settings)
+    each(parts(n, 4096), lambda first, end: _tracks(first, end, *known, pieces, count, summary))
     taken = np.arange(PIECES)[None] < count[:, None]
     owner = np.repeat(np.arange(len(count)), count)
     return torch.from_numpy(pieces[taken]), torch.from_numpy(owner), torch.from_numpy(summary)
@@ -95,66 +98,69 @@ def scene_flow(views: Views, points: Points, A: Tensor, next_b: Tensor, previous
         row = torch.cat([normal_matrix, (A * b[..., None]).sum(1)], -1)
         sums.index_add_(0, (interval * GRID**3 + cell)[inside], row[inside])
     sums = sums.reshape(intervals, GRID, GRID, GRID, 9).numpy()
-    return torch.from_numpy(_field(sums, np.array([1, *BEYOND], np.float32), np.float32(COARSE), np.float32(COARSEST)))
+    beyond, out = np.array([1, *BEYOND], np.float32), np.zeros((*sums.shape[:4], 3), np.float32)
+    each([(t,) for t in range(intervals)], lambda t: _field(t, sums, beyond, COARSE, COARSEST, out))
+    return torch.from_numpy(out)
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _field(sums, beyond, coarse_weight, coarsest_weight):
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _field(t, sums, beyond, coarse_weight, coarsest_weight, out):
     """sums (T,G,G,G,9): upper triangles and right-hand sides of normal equations per interval and voxel, to be
-    joined with those of neighbours in time and space -> their solutions (T,G,G,G,3)."""
+    joined with those of neighbours in time and space; writes the solutions of interval t to out (T,G,G,G,3)."""
     intervals, G = sums.shape[0], sums.shape[1]
     Q = G // 4
-    out = np.zeros((intervals, G, G, G, 3), np.float32)
-    for t in numba.prange(intervals):
-        near = np.zeros((G, G, G, 9), np.float32)
-        for away in range(-len(beyond) + 1, len(beyond)):
-            if 0 <= t + away < intervals:
-                weight, other = beyond[abs(away)], sums[t + away]
-                for x in range(G):
-                    for y in range(G):
-                        for z in range(G):
-                            for c in range(9):
-                                near[x, y, z, c] += weight * other[x, y, z, c]
-        coarse = np.zeros((Q, Q, Q, 9), np.float32)
-        whole = np.zeros(9, np.float32)
-        for x in range(G):
-            for y in range(G):
-                for z in range(G):
-                    for c in range(9):
-                        coarse[x // 4, y // 4, z // 4, c] += near[x, y, z, c] / 64
-        _blur(coarse)
-        for x in range(Q):
-            for y in range(Q):
-                for z in range(Q):
-                    for c in range(9):
-                        whole[c] += coarse[x, y, z, c] / (Q * Q * Q)
-        _blur(near)
-        rows = np.empty(9, np.float32)
-        for x in range(G):
-            for y in range(G):
-                for z in range(G):
-                    for c in range(9):
-                        rows[c] = near[x, y, z, c] + coarse_weight * coarse[x // 4, y // 4, z // 4, c]
-                        rows[c] += coarsest_weight * whole[c]
-                    _solve(rows, out[t, x, y, z])
-    return out
+    near = np.zeros((G, G, G, 9), np.float32)
+    for away in range(-len(beyond) + 1, len(beyond)):
+        if 0 <= t + away < intervals:
+            weight, other = beyond[abs(away)], sums[t + away]
+            for x in range(G):
+                for y in range(G):
+                    for z in range(G):
+                        for c in range(9):
+                            near[x, y, z, c] += weight * other[x, y, z, c]
+    coarse = np.zeros((Q, Q, Q, 9), np.float32)
+    whole = np.zeros(9, np.float32)
+    for x in range(G):
+        for y in range(G):
+            for z in range(G):
+                for c in range(9):
+                    coarse[x // 4, y // 4, z // 4, c] += near[x, y, z, c] / 64
+    _blur(coarse)
+    for x in range(Q):
+        for y in range(Q):
+            for z in range(Q):
+                for c in range(9):
+                    whole[c] += coarse[x, y, z, c] / (Q * Q * Q)
+    _blur(near)
+    rows = np.empty(9, np.float32)
+    for x in range(G):
+        for y in range(G):
+            for z in range(G):
+                for c in range(9):
+                    rows[c] = near[x, y, z, c] + coarse_weight * coarse[x // 4, y // 4, z // 4, c]
+                    rows[c] += coarsest_weight * whole[c]
+                _solve(rows, out[t, x, y, z])
 
 
 @numba.njit(cache=True, fastmath=True)
 def _blur(x):
     """Blurs (n,n,n,9) by the triangle 1 2 3 2 1 along each axis, zero outside; in place."""
     n = x.shape[0]
+    flat = x.reshape(-1)
     line = np.zeros((n + 4, 9), np.float32)
     for axis in range(3):
-        for a in range(n):
-            for b in range(n):
-                row = x[:, a, b] if axis == 0 else (x[a, :, b] if axis == 1 else x[a, b])
-                line[2 : n + 2] = row
-                for k in range(n):
-                    for c in range(9):
-                        row[k, c] = (
-                            line[k, c] + line[k + 4, c] + 2 * (line[k + 1, c] + line[k + 3, c]) + 3 * line[k + 2, c]
-                        ) / 9
+        below = n ** (2 - axis)  # voxels that follow while this axis stands still
+        stride = 9 * below
+        for number in range(n * n):
+            first = (number // below) * n * stride + (number % below) * 9
+            for k in range(n):
+                for c in range(9):
+                    line[k + 2, c] = flat[first + k * stride + c]
+            for k in range(n):
+                for c in range(9):
+                    near = line[k + 1, c] + line[k + 3, c]
+                    total = line[k, c] + line[k + 4, c] + 2 * near + 3 * line[k + 2, c]
+                    flat[first + k * stride + c] = total / 9
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -174,7 +180,7 @@ def _solve(row, out):
     out[2] = (C * p + (b * c - a * e) * q + (a * d - b * b) * r) * inverse
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
+@numba.njit(cache=True, fastmath=True)
 def _compare(x, y, z, j, w2c, K, seen, tol):
     """How view j sees a point: (depth error / tol, True), -inf in free space; (0, False) where it is outside
     of the image or unknown."""
@@ -190,7 +196,7 @@ def _compare(x, y, z, j, w2c, K, seen, tol):
     return (depth - seen[j, v, u]) / tol, True
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
+@numba.njit(cache=True, fastmath=True)
 def _flow_at(field, interval, p, out):
     """Trilinear value of the scene flow at p (3)."""
     grid = field.shape[1]
@@ -208,15 +214,15 @@ def _flow_at(field, interval, p, out):
             out[k] += w * field[interval, base[0] + a, base[1] + b, base[2] + c, k]
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _tracks(view, world, normal, pixel, own, frame, eye, w2c, K, seen, field, order, start, last, settings, most):
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _tracks(
+    begin, end, view, world, normal, pixel, own, frame, eye, w2c, K, seen, field, order, start, last, settings,
+    pieces, count, summary,
+):  # fmt: skip
+    """Follows the points begin…end and writes their pieces, how many these are, and their summaries."""
     tolerance, drift, longest, frontal, handover, straight = settings
-    n, steps = len(view), int(longest)
-    pieces = np.zeros((n, most, 8), np.float32)
-    count = np.zeros(n, np.int64)
-    summary = np.zeros((n, 4), np.float32)
-    views = len(frame)
-    for i in numba.prange(n):
+    steps, most, views = int(longest), pieces.shape[1], len(frame)
+    for i in range(begin, end):
         path = np.zeros((2 * steps + 1, 3), np.float32)  # places at own frame - steps … + steps
         p, flow = np.empty(3, np.float32), np.empty(3, np.float32)
         reach = np.zeros(2, np.float32)
@@ -276,7 +282,6 @@ def _tracks(view, world, normal, pixel, own, frame, eye, w2c, K, seen, field, or
             reach[side] = max(needed, 0.3)
             summary[i, side] = needed
         count[i] = _cut(path, steps, here, -reach[0], reach[1], straight * pixel[i], most, pieces[i])
-    return pieces, count, summary
 
 
 @numba.njit(cache=True, fastmath=True)

@@ -17,6 +17,7 @@ import torch
 
 from .gaussians import Gaussians4D, quaternion
 from .lift import FEATURES, Geometry, tangent_frame
+from .threads import each, parts
 from .views import Views, camera_rays
 
 CANDIDATES = 64  # distances along a ray, over its way through the unit box
@@ -33,7 +34,10 @@ def sweep_depth(views: Views) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]
     mask = views.alpha > 0.35
     args = [views.rgb, views.alpha, views.time / views.frame_step, views.c2w, torch.linalg.inv(views.c2w)]
     arrays = [np.ascontiguousarray(x.numpy(), np.float32) for x in (*args, views.intrinsics)]
-    return tuple(torch.from_numpy(x) for x in _sweep(*arrays, mask.numpy()))
+    out = [np.zeros(mask.shape, np.float32) for _ in range(3)]
+    arrays.append(np.log(np.maximum(arrays[1], np.float32(0.02))))
+    each(parts(mask.shape[0] * mask.shape[1], 64), lambda a, b: _sweep(a, b, *arrays, mask.numpy(), *out))
+    return tuple(map(torch.from_numpy, out))
 
 
 def sweep_geometry(views: Views) -> Geometry:
@@ -79,14 +83,11 @@ def relief(views: Views) -> torch.Tensor:
     return (0.5 * gap).clamp(0.5, 6.0)
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _sweep(rgb, alpha, frame, c2w, w2c, K, mask):
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _sweep(begin, end, rgb, alpha, frame, c2w, w2c, K, silhouette, mask, depth, spread, certainty):
+    """Rows begin…end, counted through all views; silhouette is the logarithm of alpha."""
     V, H, W = alpha.shape
-    depth = np.zeros((V, H, W), np.float32)
-    spread = np.zeros((V, H, W), np.float32)
-    certainty = np.zeros((V, H, W), np.float32)
-    silhouette = np.log(np.maximum(alpha, np.float32(0.02)))
-    for row in numba.prange(V * H):
+    for row in range(begin, end):
         i, v = row // H, row % H
         # The views that have a say, and where the camera of this one is in theirs.
         other, say, start = np.empty(V, np.int64), np.empty(V, np.float32), np.empty((V, 3), np.float32)
@@ -162,4 +163,3 @@ def _sweep(rgb, alpha, frame, c2w, w2c, K, mask):
             depth[i, v, u] = mean
             spread[i, v, u] = np.sqrt(max(square / total - mean * mean, 0.0))
             certainty[i, v, u] = best
-    return depth, spread, certainty

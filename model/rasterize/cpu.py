@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 
+from ..threads import each
 from . import ALPHA_MAX, T_STOP, project
 from .project import (
     BLUE, E_MIN, F32, GREEN, HU, HUU, HUV, HV, HVV, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE,
@@ -233,34 +232,6 @@ def _add_tiles(rows, starts, used, pairs, sums):
     return S
 
 
-_pool = (None, 0, 0)
-
-
-def _each(jobs, work):
-    """work(*job) for every job, on as many threads as torch uses; they take the next job when they are free.
-
-    The compiled functions release the GIL. Not numba's own threads: they are a second pool that spins against
-    torch's, die in forked processes and cannot be entered by two threads at once."""
-    global _pool
-    jobs = list(jobs)
-    threads = min(torch.get_num_threads(), len(jobs))
-    if threads < 2:
-        return [work(*job) for job in jobs]
-    if _pool[1:] != (os.getpid(), torch.get_num_threads()):
-        _pool = ThreadPoolExecutor(torch.get_num_threads()), os.getpid(), torch.get_num_threads()
-    counter, results = itertools.count(), [None] * len(jobs)
-
-    def take():
-        while (i := next(counter)) < len(jobs):
-            results[i] = work(*jobs[i])
-
-    helpers = [_pool[0].submit(take) for _ in range(threads - 1)]
-    take()
-    for helper in helpers:
-        helper.result()
-    return results
-
-
 def _bands(width, height):
     """Jobs within a view: rows of tiles, as (first, last) tile."""
     across, down = -(-width // TILE), -(-height // TILE)
@@ -282,7 +253,7 @@ class _Rasterize(torch.autograd.Function):
         (width, height), views = size, len(cameras[0])
         shape = (views, height, width)
         image, alpha, left, index = (np.empty(s, np.float32) for s in ((*shape, 3), shape, shape, shape))
-        rows = _each(
+        rows = each(
             [(c,) for c in range(views)],
             lambda c: project.project_view(c, *inputs, *cameras, width, height, inference),
         )  # per view: ids, P, starts, pairs
@@ -290,7 +261,7 @@ class _Rasterize(torch.autograd.Function):
         def blend(c, band):
             _blend_tiles(band, *rows[c][1:], background, image[c], alpha[c], left[c], index[c])
 
-        _each(itertools.product(range(views), _bands(width, height)), blend)
+        each(itertools.product(range(views), _bands(width, height)), blend)
         ctx.saved = cameras, background, rows, left, index
         return torch.from_numpy(image).to(args[0].dtype), torch.from_numpy(alpha).to(args[0].dtype)
 
@@ -306,8 +277,8 @@ class _Rasterize(torch.autograd.Function):
         def unblend(c, band):
             _unblend_tiles(band, *rows[c][1:], background, g_image[c], g_alpha[c], left[c], index[c], used[c], sums[c])
 
-        _each(itertools.product(range(views), _bands(width, height)), unblend)
-        added = _each(
+        each(itertools.product(range(views), _bands(width, height)), unblend)
+        added = each(
             [(c,) for c in range(views)],
             lambda c: _add_tiles(len(rows[c][0]), rows[c][2], used[c], rows[c][3], sums[c]),
         )
@@ -319,7 +290,7 @@ class _Rasterize(torch.autograd.Function):
             for c in range(views):
                 project.chain(c, own, rows[c][0], rows[c][1], added[c], *inputs, *cameras, width, height, out)
 
-        _each([(k,) for k in range(parts)], chain)
+        each([(k,) for k in range(parts)], chain)
         return *(torch.from_numpy(x).to(y.dtype) for x, y in zip(out, ctx.saved_tensors, strict=True)), *([None] * 6)
 
 

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiled kernels on several threads."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+
+_pool = (None, 0, 0)
+
+
+def each(jobs: Iterable[tuple], work: Callable) -> list:
+    """work(*job) for every job, on as many threads as torch uses; they take the next job when they are free.
+    Returns the results in the order of the jobs.
+
+    The compiled functions release the GIL. Not numba's own threads: they are a second pool that spins against
+    torch's, die in forked processes, cannot be entered by two threads at once, and double the compile time."""
+    global _pool
+    jobs = list(jobs)
+    threads = min(torch.get_num_threads(), len(jobs))
+    if threads < 2:
+        return [work(*job) for job in jobs]
+    if _pool[1:] != (os.getpid(), torch.get_num_threads()):
+        _pool = ThreadPoolExecutor(torch.get_num_threads()), os.getpid(), torch.get_num_threads()
+    counter, results = itertools.count(), [None] * len(jobs)
+
+    def take():
+        while (i := next(counter)) < len(jobs):
+            results[i] = work(*jobs[i])
+
+    helpers = [_pool[0].submit(take) for _ in range(threads - 1)]
+    take()
+    for helper in helpers:
+        helper.result()
+    return results
+
+
+def parts(count: int, size: int) -> list[tuple[int, int]]:
+    """0..count in consecutive ranges (first, last) of at most `size`."""
+    return [(a, min(a + size, count)) for a in range(0, count, size)]
