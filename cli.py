@@ -102,7 +102,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote, or any NeRF-style folder")
+    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote (or another in its format)")
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
     p.add_argument("--method", default="guided", help="lift, guided, rgb, sweep, predicted (default: guided)")
     p.add_argument("--rig", help="use only the views of this rig")

@@ -102,12 +102,22 @@ def save_network(path: Path, network, extra: dict[str, str] | None = None) -> No
     tmp.replace(path)
 
 
+def check_device(device: str) -> None:
+    """Raises InputError where torch cannot use a device of this name on this machine."""
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as e:
+        reason = str(e).splitlines()[0]
+        raise InputError(f"{device}: torch cannot use this device here ({reason}); choose cpu.") from None
+
+
 def load_network(path: Path, device: str = "cpu"):
     """A network in evaluation mode from a .safetensors with its config inside. Raises InputError."""
     from safetensors import safe_open
 
     from .network import Config, Network
 
+    check_device(device)
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such checkpoint; train one with `timesplat train`, or name another.")

@@ -26,7 +26,7 @@ from .lift import lift_geometry
 from .losses import geometric, photometric
 from .network import PRESETS, Network
 from .rasterize import render
-from .reconstruct import geometry_for, load_network, save_network
+from .reconstruct import check_device, geometry_for, load_network, save_network
 
 WARMUP = 100  # steps of linear warm-up
 EMA = 0.998  # per step; the shipped weights are this average
@@ -35,6 +35,7 @@ CLIP = 1.0  # gradient norm; steps beyond 20 times that are skipped
 
 def run(args: argparse.Namespace) -> int:
     """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
+    check_device(args.device)
     clips = Clips(args.data, args.cache, args.shrink)
     config = replace(PRESETS[args.preset], head=args.head, source=args.source, depth_range=args.depth_range)
     torch.manual_seed(args.seed)
