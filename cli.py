@@ -239,7 +239,7 @@ def demo(args: argparse.Namespace) -> int:
     """Render an animated object, reconstruct it three ways, export it, and lay everything side by side."""
     from .demo import run
 
-    return run(args)
+    return run(args, save_blend)
 
 
 def extension_arguments(p: argparse.ArgumentParser) -> None:

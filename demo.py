@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from .cli import save_blend
 from .datagen.render import Settings, render_shots
 from .model.asset import write_ply
 from .model.evaluate import collect, draw, evaluate_method, table, warm_up, write_metrics
@@ -25,7 +26,8 @@ SHOWN = ("lift", "guided", "rgb")  # in pictures
 ASSET = "guided"  # the method whose Gaussians are exported
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace, save_blend: Callable[[Path, Path], None]) -> int:
+    """args of `timesplat demo`; save_blend(ply, blend) writes the .blend. Returns 0, raises InputError."""
     out = args.out
     out.mkdir(parents=True, exist_ok=True)
     clock = time.perf_counter()
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _pictures(out, held_out: Views, turntable: Views, clouds: dict[str, Gaussians4D], fps: float) -> None:
+def _pictures(out: Path, held_out: Views, turntable: Views, clouds: dict[str, Gaussians4D], fps: float) -> None:
     """comparison.png: truth above each prediction, at six held-out views over time and six turntable views;
     turntable.webp: the same side by side while camera and time move."""
     few = torch.linspace(0, len(held_out) - 1, 6).round().long()

@@ -12,6 +12,7 @@ from .gaussians import FIELDS, Gaussians4D
 from .views import Views
 
 GRID = 48  # voxels along the unit box's side
+WINDOW = 4  # views closest in time whose silhouettes carve a moment
 
 
 def white(views: Views) -> Gaussians4D:
@@ -20,8 +21,8 @@ def white(views: Views) -> Gaussians4D:
     return Gaussians4D(**{k: torch.zeros(shapes.get(k, (0,))) for k in FIELDS})
 
 
-def hull(views: Views, window: int = 4) -> Gaussians4D:
-    """Per moment, the surface voxels inside the silhouettes of the `window` views closest in time, in the
+def hull(views: Views) -> Gaussians4D:
+    """Per moment, the surface voxels inside the silhouettes of the WINDOW views closest in time, in the
     mean colour of the object; each moment's voxels live for about one frame."""
     axis = (torch.arange(GRID) + 0.5) / GRID * 2 - 1
     voxel = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -38,7 +39,7 @@ def hull(views: Views, window: int = 4) -> Gaussians4D:
     step = views.frame_step
     parts = []
     for t in moments:
-        nearest = (views.time - t).abs().argsort(stable=True)[:window]
+        nearest = (views.time - t).abs().argsort(stable=True)[:WINDOW]
         solid = inside[nearest].all(0).reshape(GRID, GRID, GRID)
         surface = solid & (torch.nn.functional.avg_pool3d(solid[None].float(), 3, 1, 1)[0] < 0.999)
         xyz = voxel[surface.flatten()]

@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from ..datagen.rigs import CANONICAL
 from ..datagen.sequence import InputError, read_sequence
 from .views import Views
 
@@ -49,10 +50,9 @@ def pack(folder: Path, cache: Path) -> Path:
         known = np.isfinite(passes.depth) & (image[..., 3] > 0)
         depth = np.where(known, passes.depth, 0)[..., None]
         stack = np.concatenate([depth, passes.flow_next, passes.flow_prev], -1)
-        rgba.append(image)
+        rgba.append(np.concatenate([image, known[..., None].astype(np.uint8)], -1))
         values.append(stack[known].astype(np.float16))
         offsets.append(offsets[-1] + int(known.sum()))
-        rgba[-1] = np.concatenate([image, known[..., None].astype(np.uint8)], -1)
     c2w, intrinsics = seq.cameras()
     cameras = [v.camera for v in seq.views]
     names = sorted(set(cameras))
@@ -69,9 +69,8 @@ def pack(folder: Path, cache: Path) -> Path:
     meta = {
         "cameras": json.dumps(names),
         "frames": str(seq.frame_end - seq.frame_start + 1),
-        "name": folder.name,
+        "asset": str(seq.provenance.get("asset", folder.parent.name)),
     }
-    meta["asset"] = str(seq.provenance.get("asset", folder.parent.name))
     Path(cache).mkdir(parents=True, exist_ok=True)
     tmp = path.with_suffix(".tmp")
     save_file(tensors, tmp, meta)
@@ -109,9 +108,6 @@ class Clips:
             return Sample(inputs, held_out, meta["asset"])
 
 
-CANONICAL = ("front", "left", "back", "right")
-
-
 def choose_inputs(rng, frame, camera, names: list[str], views: int) -> np.ndarray:
     """Indices of the input views of a sample: at most `views`, in the order of time. Of the kind's cameras
     those are taken that have a view at the frame; all that have one where none of them does."""
@@ -137,7 +133,7 @@ def choose_inputs(rng, frame, camera, names: list[str], views: int) -> np.ndarra
 
 def _order(name: str) -> tuple:
     """Canonical cameras in their cyclic order first, then the others by name."""
-    return (CANONICAL.index(name), "") if name in CANONICAL else (len(CANONICAL), name)
+    return (list(CANONICAL).index(name), "") if name in CANONICAL else (len(CANONICAL), name)
 
 
 def _views(f, indices: np.ndarray, step: float) -> Views:

@@ -55,12 +55,12 @@ def evaluate_method(seq: Sequence, method: str, inputs, targets, checkpoint: Pat
     return row | {"frames": frames}, kept
 
 
-def warm_up(seq: Sequence, inputs, methods: list[str]) -> None:
+def warm_up(seq: Sequence, inputs, methods: list[str], checkpoint: Path | None = None) -> None:
     """Runs every method once on two views, so that no timing holds the compilation of kernels (about fifteen
     seconds, the first time on a machine) or imports."""
     with torch.inference_mode():
         for method in methods:
-            reconstruct_views(load_views(seq, inputs[:2], passes=method in NEEDS_PASSES), method)
+            reconstruct_views(load_views(seq, inputs[:2], method in NEEDS_PASSES), method, checkpoint=checkpoint)
 
 
 def evaluate_folders(sequences: dict[str, Sequence], methods: list[str], out: Path, checkpoint: Path | None = None):
@@ -70,8 +70,8 @@ def evaluate_folders(sequences: dict[str, Sequence], methods: list[str], out: Pa
     bar = tqdm(total=len(sequences) * len(methods), desc="evaluating", unit="run", disable=None)
     for name, seq in sequences.items():
         inputs = [i for i, v in enumerate(seq.views) if v.rig != "target"]
-        if not objects and checkpoint is None:
-            warm_up(seq, inputs, methods)
+        if not objects:
+            warm_up(seq, inputs, methods, checkpoint)
         objects[name] = {}
         for method in methods:
             bar.set_postfix_str(f"{name} {method}")

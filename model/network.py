@@ -89,7 +89,6 @@ class Network(nn.Module):
         if c.free:
             self.free_tokens = nn.Parameter(torch.randn(c.free, c.width) * 0.02)
             self.decode_free = nn.Linear(c.width, c.outputs, bias=False)
-        self.recompute = False  # gradient checkpointing, set by training
         for m in self.modules():
             if isinstance(m, nn.Linear):
                 nn.init.normal_(m.weight, std=0.02)
@@ -116,7 +115,7 @@ class Network(nn.Module):
         if c.free:
             x = torch.cat([x, self.free_tokens])
         for block in self.blocks:
-            x = _recomputed(block, x) if self.recompute else block(x)
+            x = block(x)
         x = self.norm_out(x)
         g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.outputs))  # (T, p², outputs)
 
@@ -202,13 +201,6 @@ class Network(nn.Module):
             rgb=base.rgb + 0.5 * torch.tanh(g[..., 4:7]),
             opacity=torch.sigmoid(torch.logit(base.opacity, 1e-4) + 4 * torch.tanh(0.5 * g[..., -1])),
         )
-
-
-def _recomputed(block: Block, x: Tensor) -> Tensor:
-    """block(x) whose activations are computed anew in the backward pass (gradient checkpointing)."""
-    from torch.utils.checkpoint import checkpoint  # imports a good part of torch's compiler: a second
-
-    return checkpoint(block, x, use_reentrant=False)
 
 
 _IDENTITY = torch.tensor([1.0, 0, 0, 0])

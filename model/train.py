@@ -91,7 +91,7 @@ class Trainer:
             self.seconds = base + time.perf_counter() - start
             if self.step % 20 == 0:
                 loss, psnr = np.mean(recent, axis=0)
-                rate = 20 * args.accumulate / max(shares.sum(), 1e-9)
+                rate = len(recent) * args.accumulate / max(shares.sum(), 1e-9)
                 split = dict(
                     zip(("data", "geometry", "network", "raster"), (shares / shares.sum()).round(2), strict=True)
                 )
