@@ -184,6 +184,13 @@ def single_view_video(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     return [replace(s, rig="video") for s in shots]
 
 
+def evaluation(frames: Sequence[int], seed: int = 0) -> list[Shot]:
+    """What every table of the paper takes its views from, rendered once: the four canonical cameras, the two
+    rotating ones in turn, and four random poses a frame."""
+    shots = canonical(frames) + [replace(s, rig="two_rotating") for s in two_rotating(frames)]
+    return sorted(shots + random_poses(frames, seed, per_frame=4), key=lambda s: s.frame)
+
+
 SETUPS: dict[str, Callable[[Sequence[int], int], list[Shot]]] = {
     "alternating": alternating,
     "interpolation": interpolation,
@@ -199,5 +206,6 @@ RIGS: dict[str, Callable[[Sequence[int], int], list[Shot]]] = {
     "orbit": orbit,
     "turntable": turntable,
     "demo": demo_rig,
+    "evaluation": evaluation,
     **SETUPS,
 }

@@ -9,12 +9,23 @@ while: Σ_44 = σ_t², Σ_{1:3,4} = v σ_t², Σ_xyz = Σ_3 + v vᵀ σ_t². At 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .asset import Asset, Clip
+
+
+class Moving(Protocol):
+    """A scene whose motion is not that of 4D Gaussians (a deformation field, motion bases)."""
+
+    def at(self, t: float) -> Gaussians4D:
+        """The scene at time t in [-1,1], without motion (`frozen`), differentiable."""
+
+    def __len__(self) -> int:
+        """How many Gaussians there are."""
 
 
 @dataclass
@@ -67,6 +78,20 @@ class Gaussians4D:
         top = self.covariance3() + v[..., :, None] * v[..., None, :] * s2[..., None]
         cross = (v * s2)[..., None]
         return torch.cat([torch.cat([top, cross], -1), torch.cat([cross.mT, s2[..., None]], -1)], -2)
+
+    def frozen(self, t: float, moment: float = 0.0, life: float = 1e6) -> Gaussians4D:
+        """The scene as it is at time t, unmoving around `moment` for a lifetime σ_t of `life`."""
+        return Gaussians4D(
+            xyz=self.position(torch.as_tensor(t, dtype=self.xyz.dtype)),
+            t=torch.full_like(self.t, moment),
+            velocity=torch.zeros_like(self.velocity),
+            sigma_t=torch.full_like(self.sigma_t, life),
+            scale=self.scale,
+            rotation=self.rotation,
+            rgb=self.rgb,
+            opacity=self.opacity * self.marginal(torch.as_tensor(t, dtype=self.xyz.dtype)),
+            cov3=self.cov3,
+        )
 
     def alive(self, marginal: float = 0.05, opacity: float = 0.05) -> Tensor:
         """(…,N) bool: whether the paper's inference filters let the Gaussian through at some time of the

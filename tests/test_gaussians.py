@@ -113,3 +113,13 @@ def test_alive_is_the_papers_filter_at_its_best_moment():
     g.t = torch.tensor([0.0, 0.0, 1.5, 1.05])  # the third is over before the clip's end can see it
     g.sigma_t = torch.tensor([0.1, 0.1, 0.1, 0.1])
     assert g.alive().tolist() == [True, False, False, True]
+
+
+def test_a_frozen_scene_is_the_slice_at_its_moment():
+    g = cloud(40)
+    still = g.frozen(0.3, moment=-0.5, life=0.2)
+    torch.testing.assert_close(still.position(torch.tensor(0.9)), g.position(torch.tensor(0.3)))
+    torch.testing.assert_close(
+        still.opacity * still.marginal(torch.tensor(-0.5)), g.opacity * g.marginal(torch.tensor(0.3))
+    )
+    assert torch.equal(still.t, torch.full_like(g.t, -0.5)) and torch.equal(still.sigma_t, torch.full_like(g.t, 0.2))

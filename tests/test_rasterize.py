@@ -290,3 +290,16 @@ def test_gsplat_equals_reference(name):
     assert (rgb.cpu() - want[0]).abs().mean() < 1e-4 and (alpha.cpu() - want[1]).abs().mean() < 1e-4
     for k, x, y in zip(NAMES, g.values(), want[2], strict=True):
         assert (x.grad.cpu() - y).norm() < 1e-2 * y.norm(), k
+
+
+def test_a_moving_scene_is_drawn_from_its_state_at_each_time():
+    g = gaussians()
+
+    class Slices:
+        def at(self, t):
+            return g.frozen(t)
+
+    c2w, intrinsics, _, width, height = cameras(4)
+    args = (c2w, intrinsics, torch.tensor([0.5, -0.2, 0.5, 0.9]), width, height)
+    for mine, expected in zip(render(Slices(), *args), render(g, *args), strict=True):
+        torch.testing.assert_close(mine, expected, atol=1e-5, rtol=1e-5)

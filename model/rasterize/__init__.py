@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D
+from ..gaussians import Gaussians4D, Moving
 
 BACKENDS = ("cpu", "cuda", "reference")
 NEAR = 0.01  # nearest depth of a centre
@@ -93,9 +93,19 @@ def rasterize(
 
 
 def render(
-    g: Gaussians4D, c2w: Tensor, intrinsics: Tensor, time: Tensor, width: int, height: int, **kw
+    scene: Gaussians4D | Moving, c2w: Tensor, intrinsics: Tensor, time: Tensor, width: int, height: int, **kw
 ) -> tuple[Tensor, Tensor]:
-    """`rasterize` of a cloud without batch dimensions; same cameras, keywords, results and errors."""
+    """`rasterize` of a cloud without batch dimensions, or of another moving scene, which is asked for its
+    state once for every distinct time; same cameras, keywords, results and errors."""
+    if not isinstance(scene, Gaussians4D):
+        images = [None] * len(time)
+        for t in time.unique().tolist():
+            here = (time == t).nonzero()[:, 0].tolist()
+            drawn = render(scene.at(t), c2w[here], intrinsics[here], 0 * time[here], width, height, **kw)
+            for i, rgb, alpha in zip(here, *drawn, strict=True):
+                images[i] = (rgb, alpha)
+        return tuple(map(torch.stack, zip(*images, strict=True)))
+    g = scene
     return rasterize(
         g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity,
         c2w, intrinsics, time, width, height, **kw
