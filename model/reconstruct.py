@@ -11,22 +11,25 @@ import torch
 
 from ..datagen.sequence import InputError, Sequence
 from .asset import Clip, pixel_size
-from .gaussians import Gaussians4D
+from .gaussians import Gaussians4D, Moving
 from .views import Views, load_views, pad_to_multiple
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
-# What each method needs: depth and motion vectors, or pictures with alpha alone.
+# What each method is, whose it is, and what it needs: depth and motion vectors, or pictures with alpha alone.
 METHODS = {
-    "white": "the empty picture",
-    "hull": "visual hull in the object's mean colour (RGB and alpha)",
-    "lift": "depth and motion vectors to Gaussians, no network",
-    "guided": "the network over depth and motion vectors",
-    "rgb": "the network over RGB alone: the better of `sweep` and `predicted` on held-out objects",
-    "sweep": "the network over RGB with depths swept from the other views",
+    "white": "reference: the empty picture",
+    "hull": "reference: visual hull in the object's mean colour (RGB and alpha)",
+    "lift": "ours: depth and motion vectors to Gaussians, no network",
+    "guided": "ours: the network over depth and motion vectors",
+    "rgb": "ours: the network over RGB alone: the better of `sweep` and `predicted` on held-out objects",
+    "sweep": "ours: the network over RGB with depths swept from the other views",
     "predicted": "the paper's network over RGB, token dropping on",
+    "gs-lrm-frame": "after GS-LRM: our network trained without time, each frame from its own views alone",
+    "gs-lrm-all": "after GS-LRM: our network trained without time, all views taken for one moment",
 }
 NEEDS_PASSES = {"lift", "guided"}
-RGB = "sweep"  # what `rgb` stands for
+# The checkpoint of a method that does not have one of its own name.
+WEIGHTS = {"rgb": "sweep", "gs-lrm-frame": "static", "gs-lrm-all": "static"}
 
 
 def clip_of(seq: Sequence) -> Clip:
@@ -42,8 +45,8 @@ def reconstruct(
     device: str = "cpu",
     checkpoint: Path | None = None,
     progress=None,
-) -> Gaussians4D:
-    """Views `indices` of the Sequence (all of them by default) -> Gaussians4D, those filtered out that the
+) -> Gaussians4D | Moving:
+    """Views `indices` of the Sequence (all of them by default) -> the scene, Gaussians filtered out that the
     paper's inference filters would never draw. `progress(fraction, text)` is called between steps.
 
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint."""
@@ -61,18 +64,32 @@ def reconstruct(
     return g[g.alive()]
 
 
-def reconstruct_views(views: Views, method: str, device: str = "cpu", checkpoint: Path | None = None) -> Gaussians4D:
+def reconstruct_views(
+    views: Views, method: str, device: str = "cpu", checkpoint: Path | None = None
+) -> Gaussians4D | Moving:
     """The same from tensors; unfiltered."""
     if method in ("white", "hull"):
-        from . import baselines
+        from .baselines import hull
 
-        return getattr(baselines, method)(views)
+        return getattr(hull, method)(views)
     if method == "lift":
         from .lift import lift
 
         return lift(views)
-    method = RGB if method == "rgb" else method
-    network = load_network(checkpoint or CHECKPOINTS / f"{method}.safetensors", device)
+    network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
+
+    def run(views: Views) -> Gaussians4D:
+        return apply_network(network, views, device)
+
+    if method.startswith("gs-lrm"):
+        from .baselines import gs_lrm
+
+        return {"gs-lrm-frame": gs_lrm.per_frame, "gs-lrm-all": gs_lrm.all_in}[method](views, run)
+    return run(views)
+
+
+def apply_network(network, views: Views, device: str = "cpu") -> Gaussians4D:
+    """Views of any size -> what the network makes of them and of their Geometry, on the CPU."""
     views = pad_to_multiple(views, network.config.patch)
     geometry = geometry_for(network.config.source, views)
     return network(views.to(device), geometry and geometry.to(device)).to("cpu")

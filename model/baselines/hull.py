@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What costs nothing: the references that every method must beat.
-
-`white` is the empty picture; `hull` the visual hull in the object's mean colour.
-"""
+"""What costs nothing: the empty picture, and the visual hull in the object's mean colour."""
 
 from __future__ import annotations
 
 import torch
 
-from .gaussians import FIELDS, Gaussians4D
-from .views import Views
+from ..gaussians import FIELDS, Gaussians4D
+from ..views import Views
 
 GRID = 48  # voxels along the unit box's side
 WINDOW = 4  # views closest in time whose silhouettes carve a moment
