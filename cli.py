@@ -79,6 +79,8 @@ def train_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--head", choices=["paper", "kinematic"], default="kinematic", help="20 or 19 outputs a pixel")
     p.add_argument("--source", choices=["given", "sweep", "predicted"], default="given", help="where depth comes from")
     p.add_argument("--depth-range", choices=["paper", "centred"], default="paper", help="for --source predicted")
+    p.add_argument("--time", choices=["free", "aligned"], default="free", help="of a pixel: free, or its frame's")
+    p.add_argument("--free", type=int, default=0, help="free Gaussians beside the pixels' (default: 0)")
     p.add_argument("--init", type=Path, help="checkpoint to start from, instead of random weights")
     p.add_argument("--steps", type=int, default=100_000, help="stop after this many steps (default: 100000)")
     p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")

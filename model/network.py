@@ -15,12 +15,13 @@ Beyond the paper, and off where its letter is wanted:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ..datagen.sequence import InputError
 from .gaussians import Gaussians4D, isoclinic_rotation, kinematic_from_covariance
 from .lift import FEATURES, Geometry
 from .views import Views, pluecker, rays
@@ -36,6 +37,7 @@ class Config:
     source: str = "predicted"  # predicted | sweep | given
     depth_range: str = "paper"  # paper: 0.1..4.5 | centred: 1.8 to either side of the ray's middle
     free: int = 0  # free Gaussian tokens
+    time: str = "free"  # of a pixel's Gaussian: free | aligned: its frame's, or where its Geometry has it
 
     @property
     def channels(self) -> int:
@@ -43,7 +45,13 @@ class Config:
 
     @property
     def outputs(self) -> int:
+        """Numbers that define one Gaussian."""
         return 20 if self.head == "paper" else 19
+
+    @property
+    def pixel_outputs(self) -> int:
+        """Those that the network decodes for a pixel's."""
+        return self.outputs - (self.time == "aligned")
 
 
 PRESETS = {
@@ -52,6 +60,9 @@ PRESETS = {
     "small": Config(width=384, depth=6, heads=6),
     "tiny": Config(width=256, depth=4, heads=4),
 }
+
+
+FAINT, SMALL = -2.6, -1.5  # where free Gaussians join others: added to the logit of opacity and to log σ
 
 
 class Block(nn.Module):
@@ -85,15 +96,19 @@ class Network(nn.Module):
         self.norm_in = nn.LayerNorm(c.width, bias=False)
         self.blocks = nn.ModuleList(Block(c.width, c.heads) for _ in range(c.depth))
         self.norm_out = nn.LayerNorm(c.width, bias=False)
-        self.decode = nn.Linear(c.width, c.patch**2 * c.outputs, bias=False)
+        self.decode = nn.Linear(c.width, c.patch**2 * c.pixel_outputs, bias=False)
         if c.free:
             self.free_tokens = nn.Parameter(torch.randn(c.free, c.width) * 0.02)
-            self.decode_free = nn.Linear(c.width, c.outputs, bias=False)
+            self.decode_free = nn.Linear(c.width, c.outputs)
         for m in self.modules():
             if isinstance(m, nn.Linear):
                 nn.init.normal_(m.weight, std=0.02)
+        if c.free:
+            nn.init.zeros_(self.decode_free.bias)
+            nn.init.normal_(self.decode_free.weight[:4], std=c.width**-0.5)  # tanh spreads them over the box
         if c.source != "predicted":
             nn.init.zeros_(self.decode.weight)  # starts as the Geometry itself
+            self.fade_free()
 
     def forward(self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True) -> Gaussians4D:
         """views: V images, height and width multiples of the patch; geometry: for the sources `sweep` and
@@ -110,14 +125,18 @@ class Network(nn.Module):
             maps.append(geometry.features)
         keep = self.kept_patches(views, drop_empty)
         x = patchify(torch.cat(maps, -1), p)[keep]  # (T, p², channels)
-        x = self.norm_in(self.embed(x.flatten(1)))  # (T, D)
+        x = self.embed(x.flatten(1))  # (T, D)
         tokens = len(x)
         if c.free:
             x = torch.cat([x, self.free_tokens])
+        x = self.norm_in(x)
         for block in self.blocks:
             x = block(x)
         x = self.norm_out(x)
-        g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.outputs))  # (T, p², outputs)
+        g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.pixel_outputs))  # (T, p², outputs)
+        if c.time == "aligned":
+            at = torch.zeros_like(time) if geometry is not None else time
+            g = torch.cat([g[..., :3], gather_pixels(at, keep, p), g[..., 3:]], -1)
 
         if geometry is not None:
             row = self.rows(views, keep)[geometry.owner]  # (M,) which of the outputs is about which Gaussian
@@ -130,9 +149,23 @@ class Network(nn.Module):
             pixels = (gather_pixels(m, keep, p) for m in (origin, direction))
             out = self.pixel_aligned(g, *pixels).map(lambda m: m.flatten(0, 1))
         if c.free:
-            free = self.activate(self.decode_free(x[tokens:]).float())
-            out = Gaussians4D.cat([out, free])
+            out = Gaussians4D.cat([out, self.free_gaussians(self.decode_free(x[tokens:]).float())])
         return out
+
+    def free_gaussians(self, g: Tensor) -> Gaussians4D:
+        """g (N,outputs) -> Gaussians with centres anywhere in the box and the clip (paper, section 2.2)."""
+        out = self.activate(g)
+        out.xyz, out.t = torch.tanh(out.xyz), torch.tanh(out.t)
+        return out
+
+    @torch.no_grad()
+    def fade_free(self) -> None:
+        """Makes the free Gaussians, if any, start small (σ of 0.02) and faint (0.01), so that the picture is that
+        of the others. Not fainter: below 1/255 no rasteriser would send them a gradient."""
+        if self.config.free:
+            self.decode_free.weight[-1] = 0
+            self.decode_free.bias[-1] = FAINT
+            self.decode_free.bias[7:10] = SMALL
 
     def kept_patches(self, views: Views, drop_empty: bool = True) -> Tensor:
         """(P,) bool: the patches that become tokens; with `drop_empty` those that show any foreground."""
@@ -201,6 +234,19 @@ class Network(nn.Module):
             rgb=base.rgb + 0.5 * torch.tanh(g[..., 4:7]),
             opacity=torch.sigmoid(torch.logit(base.opacity, 1e-4) + 4 * torch.tanh(0.5 * g[..., -1])),
         )
+
+
+def load_matching(network: Network, trained: Network) -> None:
+    """Copies the weights of `trained`, which may lack the network's free Gaussians: these then start faint.
+    Raises InputError where the two differ in anything else."""
+    here, there = asdict(network.config), asdict(trained.config)
+    differ = [k for k in here if here[k] != there[k] and not (k == "free" and not there[k])]
+    if differ:
+        text = ", ".join(f"{k} {there[k]} instead of {here[k]}" for k in differ)
+        raise InputError(f"the checkpoint to start from has {text}; train with the same, or from random weights.")
+    network.load_state_dict(trained.state_dict(), strict=False)
+    if here["free"] != there["free"]:
+        network.fade_free()
 
 
 _IDENTITY = torch.tensor([1.0, 0, 0, 0])

@@ -24,7 +24,7 @@ from .data import Clips, Sample
 from .gaussians import Gaussians4D
 from .lift import lift_geometry
 from .losses import geometric, photometric
-from .network import PRESETS, Network
+from .network import PRESETS, Network, load_matching
 from .rasterize import render
 from .reconstruct import check_device, geometry_for, load_network, save_network
 
@@ -37,11 +37,12 @@ def run(args: argparse.Namespace) -> int:
     """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
     check_device(args.device)
     clips = Clips(args.data, args.cache, args.shrink)
-    config = replace(PRESETS[args.preset], head=args.head, source=args.source, depth_range=args.depth_range)
+    chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free")}
+    config = replace(PRESETS[args.preset], **chosen)
     torch.manual_seed(args.seed)
     network = Network(config)
     if args.init:
-        network.load_state_dict(load_network(args.init).state_dict())
+        load_matching(network, load_network(args.init))
     Trainer(network.to(args.device), clips, args).run()
     return 0
 
@@ -164,7 +165,7 @@ class Trainer:
         loss = photometric(rgb, alpha, targets, background)
         if truth is not None:
             weight = args.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
-            loss = loss + weight * geometric(g, *truth)
+            loss = loss + weight * geometric(g[: len(truth[0])], *truth)
         clock.append(time.perf_counter())
         with torch.no_grad():
             mse = (rgb - targets.over(background)).square().mean((1, 2, 3)).clamp_min(1e-10)

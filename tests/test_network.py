@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+from timesplat.datagen.sequence import InputError
 from timesplat.model.lift import lift_geometry
-from timesplat.model.network import PRESETS, Config, Network, multiply, patchify
+from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patchify
 from timesplat.model.sweep import sweep_geometry
+from timesplat.model.views import rays
 
 TINY = {"width": 32, "depth": 2, "heads": 2}
 
@@ -79,10 +81,76 @@ def test_untrained_network_equals_its_geometry(views, source, make):
     torch.testing.assert_close(g.opacity, base.opacity, rtol=0, atol=1e-4)
 
 
-def test_free_gaussians_join_the_pixels(views):
+def test_untrained_free_gaussians_fill_the_box_and_the_clip(views):
     torch.manual_seed(0)
-    g = Network(Config(**TINY, head="paper", free=5)).eval()(views, drop_empty=False)
-    assert len(g) == 3 * 32 * 32 + 5
+    g = Network(Config(**TINY, head="paper", free=200)).eval()(views, drop_empty=False)
+    assert len(g) == 3 * 32 * 32 + 200
+    centre = torch.cat([g.xyz, g.t[:, None]], 1)[-200:]
+    assert centre.abs().max() <= 1
+    assert (centre.std(0) > 0.4).all() and (centre.mean(0).abs() < 0.3).all()  # evenly spread would be 0.58
+
+
+@pytest.mark.parametrize("source", ["predicted", "sweep"])
+def test_free_gaussians_join_a_trained_network_faintly(views, source):
+    torch.manual_seed(0)
+    old = Network(Config(**TINY, source=source)).eval()
+    new = Network(Config(**TINY, source=source, free=7)).eval()
+    load_matching(new, old)
+    geometry = sweep_geometry(views) if source == "sweep" else None
+    a, b = old(views, geometry), new(views, geometry)
+    assert len(b) == len(a) + 7 and (b[: len(a)].xyz - a.xyz).abs().max() < 0.1
+    added = b[len(a) :]
+    assert (added.opacity < 0.0101).all() and not added.alive().any()
+    assert (added.opacity > 2 / 255).all()  # enough to be drawn, and so to learn
+    again = Network(Config(**TINY, source=source, free=7)).eval()
+    load_matching(again, new)
+    assert torch.equal(again(views, geometry).xyz, b.xyz)
+
+
+def test_another_architecture_is_refused():
+    with pytest.raises(InputError, match="has width 32 instead of 64, free 3 instead of 0; train"):
+        load_matching(Network(Config(64, 2, 2)), Network(Config(**TINY, free=3)))
+
+
+@pytest.mark.parametrize("head", ["paper", "kinematic"])
+@pytest.mark.parametrize("source", ["predicted", "sweep", "given"])
+def test_temporal_alignment_fixes_the_time_alone(views, head, source):
+    """The network with one output fewer equals the free one whose output is 0, but for μ_t."""
+    torch.manual_seed(0)
+    make = {"sweep": sweep_geometry, "given": lift_geometry}.get(source)
+    geometry = make(views) if make else None
+    aligned = Network(Config(**TINY, head=head, source=source, time="aligned")).eval()
+    free = Network(Config(**TINY, head=head, source=source)).eval()
+    n = free.config.outputs
+    assert aligned.decode.weight.shape[0] == 64 * (n - 1)
+    torch.nn.init.normal_(aligned.decode.weight, std=0.1)
+    state = aligned.state_dict()
+    rows = aligned.decode.weight.detach().unflatten(0, (64, n - 1))
+    zero = torch.zeros(64, 1, 32)
+    state["decode.weight"] = torch.cat([rows[:, :3], zero, rows[:, 3:]], 1).flatten(0, 1)
+    free.load_state_dict(state)
+    a, b = aligned(views, geometry), free(views, geometry)
+    for k in ("xyz", "velocity", "sigma_t", "rgb", "opacity"):
+        torch.testing.assert_close(getattr(a, k), getattr(b, k), atol=1e-6, rtol=1e-5)
+    if source == "predicted":
+        keep = aligned.kept_patches(views)
+        own = views.time[:, None].expand(3, 16).flatten()[keep]
+        assert torch.equal(a.t, own.repeat_interleave(64))
+    else:
+        assert torch.equal(a.t, geometry.gaussians.t)
+
+
+def test_centred_depth_starts_where_the_ray_passes_the_centre(views):
+    torch.manual_seed(0)
+    net = Network(Config(**TINY, depth_range="centred")).eval()
+    net.decode.weight.data *= 1e4  # omega is 0 or 1: the ends of the range
+    origin, direction = rays(views.c2w, views.intrinsics, *views.size)
+    keep = net.kept_patches(views, drop_empty=False)
+    middle = gather_pixels(origin - (origin * direction).sum(-1, keepdim=True) * direction, keep, 8).flatten(0, 1)
+    ends = (net(views, drop_empty=False).xyz - middle).norm(dim=-1)
+    assert ends.max() < 1.8001 and (ends > 1.79).float().mean() > 0.9
+    torch.nn.init.zeros_(net.decode.weight)
+    torch.testing.assert_close(net(views, drop_empty=False).xyz, middle, atol=1e-5, rtol=0)
 
 
 def test_order_of_views_does_not_matter(views):
