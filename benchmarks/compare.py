@@ -303,14 +303,13 @@ def score(folder: Path, pairs: list[tuple]) -> dict:
 
     from timesplat.model.evaluate import draw
     from timesplat.model.metrics import psnr, psnr_foreground
-    from timesplat.model.reconstruct import geometry_for, load_network
+    from timesplat.model.reconstruct import apply_network, load_network
 
     network = load_network(folder / "network.safetensors")
     out = {"psnr": [], "psnr_fg": [], "white": [], "white_fg": []}
     for inputs, targets in pairs:
         with torch.inference_mode():
-            g = network(inputs, geometry_for(network.config.source, inputs))
-            rgb, alpha = draw(g[g.alive()], targets)
+            rgb, alpha = draw(apply_network(network, inputs), targets)
         truth = targets.over(1.0)
         empty = torch.ones_like(truth)
         out["psnr"].append(float(psnr(rgb, truth).mean()))

@@ -102,6 +102,28 @@ def save(fig, stem: Path, command: str) -> None:
     plt.close(fig)
 
 
+def save_picture(image, stem: Path, command: str) -> None:
+    """A PIL image as PNG with the command below it, and as SVG that holds the same picture."""
+    import base64
+    import html
+    import textwrap
+
+    from PIL import Image, ImageDraw, ImageFont
+
+    lines = textwrap.wrap(command, max(image.width // 6, 40), break_long_words=True, break_on_hyphens=False)
+    sheet = Image.new("RGB", (image.width, image.height + 12 * len(lines) + 8), "white")
+    sheet.paste(image, (0, 0))
+    ImageDraw.Draw(sheet).text((4, image.height + 2), "\n".join(lines), fill="#707070", font=ImageFont.load_default(9))
+    data = io.BytesIO()
+    sheet.save(data, "PNG")
+    replace(stem.with_name(stem.name + ".png"), data.getvalue())
+    inside = base64.b64encode(data.getvalue()).decode()
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg" width="{sheet.width}" height="{sheet.height}">'
+    svg += f"<desc>{html.escape(command)}</desc>"
+    svg += f'<image width="{sheet.width}" height="{sheet.height}" href="data:image/png;base64,{inside}"/></svg>\n'
+    replace(stem.with_name(stem.name + ".svg"), svg.encode())
+
+
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
     """(n,) running mean over `window` values, centred, over what is there at the ends."""
     values = np.asarray(values, float)
