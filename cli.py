@@ -81,16 +81,32 @@ def train_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--depth-range", choices=["paper", "centred"], default="paper", help="for --source predicted")
     p.add_argument("--time", choices=["free", "aligned"], default="free", help="of a pixel: free, or its frame's")
     p.add_argument("--free", type=int, default=0, help="free Gaussians beside the pixels' (default: 0)")
+    p.add_argument("--motion", choices=["gaussian", "hexplane"], default="gaussian", help="what moves Gaussians")
     p.add_argument("--init", type=Path, help="checkpoint to start from, instead of random weights")
     p.add_argument("--steps", type=int, default=100_000, help="stop after this many steps (default: 100000)")
     p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")
-    p.add_argument("--views", type=int, default=24, help="input views of a sample (default: 24)")
-    p.add_argument("--targets", type=int, default=8, help="supervision views of a sample (default: 8)")
+    p.add_argument(
+        "--sampling",
+        choices=["setups", "paper", "video", "static"],
+        default="setups",
+        help="views of a sample: as the evaluation setups (default), of 36 at random, front video, of one frame",
+    )
+    p.add_argument(
+        "--static", dest="sampling", action="store_const", const="static", help="short for --sampling static"
+    )
+    p.add_argument("--views", type=int, help="input views of a sample (default: 24; paper 12, video 27, static 4)")
+    p.add_argument("--targets", type=int, help="supervision views of a sample (default: 8; paper 24, static 4)")
+    p.add_argument("--mix", default="200:50:1", help="weights of much moving : moving : still clips, or uniform")
     p.add_argument("--shrink", type=int, default=1, help="train at 1/N of the rendered size (curriculum; default: 1)")
     p.add_argument("--rate", type=float, default=4e-4, help="peak learning rate (default: 4e-4)")
+    p.add_argument("--warmup", type=int, default=100, help="steps of linear warm-up (default: 100; the paper's: 2000)")
+    p.add_argument("--optimiser", choices=["adamw", "muon"], default="adamw", help="muon: for the blocks' matrices")
     p.add_argument("--accumulate", type=int, default=1, help="samples per step (default: 1)")
+    p.add_argument("--perceptual", type=float, default=0.5, help="weight of the VGG-19 loss, if there are weights")
     p.add_argument("--geometric", type=float, default=0.0, help="weight of the geometric loss, for RGB sources")
+    p.add_argument("--opacity", type=float, default=0.0, help="weight of the mean opacity (default: 0)")
     p.add_argument("--bf16", action="store_true", help="run the transformer in bfloat16")
+    p.add_argument("--checkpointing", action="store_true", help="keep less memory, compute blocks twice")
     p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     p.add_argument("--cache", type=Path, default=Path("data/cache"), help="where packed clips are kept")
     p.add_argument("--seed", type=int, default=0)

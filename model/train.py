@@ -2,7 +2,9 @@
 """Training of the network on rendered clips: `timesplat train DATA… --out RUN`.
 
 A RUN folder holds `log.jsonl` (a line per report), `state.pt` (all that an exact resume needs) and
-`network.safetensors` (the averaged weights, ready for `--checkpoint`). Calling it again goes on.
+`network.safetensors` (the averaged weights, ready for `--checkpoint`). Calling it again goes on. The paper's own
+training (section 4.1, appendix) is `--preset large --source predicted --sampling paper --warmup 2000 --bf16
+--checkpointing --accumulate N` under torchrun; what differs by default was better at the scale of one machine.
 """
 
 from __future__ import annotations
@@ -11,53 +13,78 @@ import argparse
 import json
 import math
 import os
+import resource
 import signal
 import time
 from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from ..datagen.sequence import InputError
+from . import distributed
 from .data import Clips, Sample
+from .deferred import Cut
 from .gaussians import Gaussians4D
 from .lift import lift_geometry
-from .losses import geometric, photometric
+from .losses import geometric, load_perceptual, photometric
 from .network import PRESETS, Network, load_matching
-from .rasterize import render
+from .optimiser import learning_rate, make_optimisers, take_step
 from .reconstruct import check_device, geometry_for, load_network, save_network
+from .sampling import VIEWS
+from .views import Views
 
-WARMUP = 100  # steps of linear warm-up
 EMA = 0.998  # per step; the shipped weights are this average
-CLIP = 1.0  # gradient norm; steps beyond 20 times that are skipped
+STAGES = ("data", "geometry", "network", "raster")  # what a step's time is spent on
 
 
 def run(args: argparse.Namespace) -> int:
     """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
     check_device(args.device)
-    clips = Clips(args.data, args.cache, args.shrink)
-    chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free")}
-    config = replace(PRESETS[args.preset], **chosen)
-    torch.manual_seed(args.seed)
-    network = Network(config)
-    if args.init:
-        load_matching(network, load_network(args.init))
-    Trainer(network.to(args.device), clips, args).run()
+    args.device = distributed.start(args.device)
+    try:
+        clips = load_clips(args)
+        chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free")}
+        config = replace(PRESETS[args.preset], **chosen)
+        torch.manual_seed(args.seed)
+        network = Network(config)
+        if args.init:
+            load_matching(network, load_network(args.init))
+        Trainer(network.to(args.device), clips, args).run()
+    finally:
+        distributed.end()
     return 0
 
 
+def load_clips(args: argparse.Namespace) -> Clips:
+    """The clips; one process packs, the others then find them packed."""
+    if distributed.rank():
+        distributed.wait()
+    clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix)
+    if not distributed.rank():
+        distributed.wait()
+        print(clips)
+    return clips
+
+
 class Trainer:
-    """The state of a run: network, average, optimiser, and how far it has come."""
+    """The state of a run: network, average, optimisers, and how far it has come."""
 
     def __init__(self, network: Network, clips: Clips, args: argparse.Namespace):
         self.network, self.clips, self.args = network, clips, args
+        network.checkpointing = args.checkpointing
+        self.views, self.targets = (
+            a or b for a, b in zip((args.views, args.targets), VIEWS[args.sampling], strict=True)
+        )
+        self.perceptual = load_perceptual() if args.perceptual else None
+        if self.perceptual:
+            self.perceptual.to(args.device)
         self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-        matrices = [p for p in network.parameters() if p.ndim > 1]
-        others = [p for p in network.parameters() if p.ndim <= 1]
-        groups = [{"params": matrices, "weight_decay": 0.05}, {"params": others, "weight_decay": 0.0}]
-        self.optimiser = torch.optim.AdamW(groups, lr=args.rate, betas=(0.9, 0.95))
-        self.step, self.seconds, self.skipped = 0, 0.0, 0
+        self.optimisers = make_optimisers(network, args.optimiser)
+        self.step, self.seconds, self.cpu = 0, 0.0, 0.0
+        self.skipped, self.bad = 0, 0  # steps whose gradient was not sound; samples whose loss was not finite
         self.stopped = False
         self.state = args.out / "state.pt"
         args.out.mkdir(parents=True, exist_ok=True)
@@ -81,73 +108,72 @@ class Trainer:
             raise KeyboardInterrupt
 
     def _loop(self) -> None:
-        args, start, base = self.args, time.perf_counter(), self.seconds
-        bar = tqdm(
-            total=1.0, disable=None, bar_format="{l_bar}{bar}| {elapsed}<{remaining}{postfix}", desc=args.out.name
-        )
+        args, wall, cpu = self.args, self.seconds - time.perf_counter(), self.cpu - time.process_time()
+        layout = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
+        bar = tqdm(total=1.0, disable=None if not distributed.rank() else True, bar_format=layout, desc=args.out.name)
         recent: list[tuple[float, float]] = []
-        shares = np.zeros(4)
+        shares = np.zeros(len(STAGES))
         while self.progress() < 1 and not self.stopped:
             recent.append(self.train_step(shares))
-            self.seconds = base + time.perf_counter() - start
+            seconds, stopped = distributed.greatest([wall + time.perf_counter(), self.stopped], args.device)
+            self.seconds, self.stopped, self.cpu = seconds, bool(stopped), cpu + time.process_time()
             if self.step % 20 == 0:
-                loss, psnr = np.mean(recent, axis=0)
-                rate = len(recent) * args.accumulate / max(shares.sum(), 1e-9)
-                split = dict(
-                    zip(("data", "geometry", "network", "raster"), (shares / shares.sum()).round(2), strict=True)
-                )
-                line = {"step": self.step, "seconds": round(self.seconds), "loss": round(float(loss), 5)}
-                line |= {
-                    "psnr": round(float(psnr), 3),
-                    "samples_per_s": round(rate, 2),
-                    "skipped": self.skipped,
-                }
-                with open(args.out / "log.jsonl", "a") as f:
-                    f.write(json.dumps(line | {"share": {k: float(v) for k, v in split.items()}}) + "\n")
-                bar.set_postfix_str(f" step {self.step} loss {loss:.4f} psnr {psnr:.2f} {rate:.2f} samples/s")
-                recent, shares = [], np.zeros(4)
+                line = self.report(recent, shares)
+                bar.set_postfix_str(" {step} loss {loss:.4f} psnr {psnr:.2f} {samples_per_s} samples/s".format(**line))
+                recent, shares = [], np.zeros(len(STAGES))
             bar.update(self.progress() - bar.n)
             if self.step % 200 == 0:
                 self.save()
         self.save()
         bar.close()
 
+    def report(self, recent: list[tuple[float, float]], shares: np.ndarray) -> dict:
+        """A line of the log: means since the last one; seconds by the clock and of processor time (under load only
+        the latter compares) since the start of the run; memory in MB, the highest so far."""
+        loss, psnr = np.mean([r for r in recent if math.isfinite(r[0])] or [(math.nan, math.nan)], axis=0)
+        samples = len(recent) * self.args.accumulate * distributed.size()
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
+        line = {"step": self.step, "seconds": round(self.seconds, 1), "cpu_seconds": round(self.cpu, 1)}
+        line |= {"loss": round(float(loss), 5), "psnr": round(float(psnr), 3)}
+        line |= {"samples_per_s": round(samples / max(shares.sum(), 1e-9), 2), "memory": round(memory)}
+        if self.args.device.startswith("cuda"):
+            line["cuda_memory"] = round(torch.cuda.max_memory_allocated(self.args.device) / 2**20)
+        line |= {"skipped": self.skipped, "bad": self.bad}
+        line["share"] = dict(zip(STAGES, (shares / shares.sum()).round(2).tolist(), strict=True))
+        if not distributed.rank():
+            with open(self.args.out / "log.jsonl", "a") as f:
+                f.write(json.dumps(line) + "\n")
+        return line
+
     def train_step(self, shares: np.ndarray) -> tuple[float, float]:
-        """One optimiser step over `accumulate` samples -> mean loss and PSNR of the targets. Seeded by the
-        step's number, so that a resumed run draws what an unbroken one would have."""
+        """One optimiser step over `accumulate` samples -> mean loss and PSNR of the targets, NaN if all were bad.
+        Samples are seeded by the step and their number in it, over all processes: a resumed run draws what an
+        unbroken one would have, and two processes what one with twice the samples would."""
         args = self.args
-        rng = np.random.default_rng((args.seed, self.step))
         self.network.train()
-        losses, scores = [], []
-        for _ in range(args.accumulate):
+        results = []
+        for n in range(args.accumulate):
+            rng = np.random.default_rng((args.seed, self.step, distributed.rank() * args.accumulate + n))
             clock = [time.perf_counter()]
-            sample = self.clips.sample(rng, args.targets, args.views)
+            sample = self.clips.sample(rng, self.targets, self.views)
             clock.append(time.perf_counter())
-            loss, score, clock2 = self.sample_loss(sample, rng)
-            (loss / args.accumulate).backward()
-            clock += [*clock2, time.perf_counter()]
-            spent = np.diff(clock)  # the backward pass is split in the forward's proportion
-            forward = spent[2] + spent[3]
-            shares += [spent[0], spent[1], *(spent[2:4] * (1 + spent[4] / max(forward, 1e-9)))]
-            losses.append(float(loss.detach()))
-            scores.append(score)
-        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP))
-        rate = args.rate * min(1, (self.step + 1) / WARMUP) * 0.5 * (1 + math.cos(math.pi * min(self.progress(), 1)))
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        if math.isfinite(norm) and (norm < 20 * CLIP or self.step < WARMUP):
-            self.optimiser.step()
-        else:
-            self.skipped += 1
-        self.optimiser.zero_grad(set_to_none=True)
+            results.append(self.learn(sample, rng, clock))
+            data, geometry, forward, raster, backward = np.diff(clock)
+            shares += [data, geometry, forward + backward, raster]
+        distributed.average_gradients(self.network)
+        rate = learning_rate(args.rate, self.step, args.warmup, self.progress())
+        self.skipped += not take_step(self.optimisers, rate, warm=self.step >= args.warmup)
         self.step += 1
         decay = min(EMA, self.step / (self.step + 10))
         for k, v in self.network.state_dict().items():
             self.average[k].lerp_(v, 1 - decay)
-        return float(np.mean(losses)), float(np.mean(scores))
+        good = [r for r in results if r is not None]
+        self.bad += len(results) - len(good)
+        return tuple(np.mean(good or [(np.nan, np.nan)], axis=0).tolist())
 
-    def sample_loss(self, sample: Sample, rng: np.random.Generator):
-        """-> loss, PSNR of the target views over white, and the times at which stages ended."""
+    def learn(self, sample: Sample, rng: np.random.Generator, clock: list[float]) -> tuple[float, float] | None:
+        """Adds a sample's gradients to the network's. Returns its loss and the PSNR of its targets; None, and no
+        gradients, where the loss is not finite. Appends the times at which stages ended to the clock."""
         args, network = self.args, self.network
         geometry = geometry_for(network.config.source, sample.inputs)
         truth = None
@@ -155,22 +181,39 @@ class Trainer:
             truth = [x.to(args.device) for x in self.pixel_truth(sample.inputs, geometry)]
         inputs, targets = sample.inputs.to(args.device), sample.targets.to(args.device)
         geometry = geometry and geometry.to(args.device)
-        clock = [time.perf_counter()]
+        clock.append(time.perf_counter())
         with torch.autocast(args.device.split(":")[0], torch.bfloat16, enabled=args.bf16):
             g = network(inputs, geometry)
+        more = self.scene_loss(g, truth)
         clock.append(time.perf_counter())
-        background = torch.tensor(rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.ones(3)).float().to(args.device)
-        height, width = targets.size
-        rgb, alpha = render(g, targets.c2w, targets.intrinsics, targets.time, width, height, background=background)
-        loss = photometric(rgb, alpha, targets, background)
+        colour = rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.ones(3)
+        background = torch.tensor(colour).float().to(args.device)
+
+        def picture_loss(rgb: Tensor, alpha: Tensor, few: Views) -> Tensor:
+            loss = photometric(rgb, alpha, few, background)
+            if self.perceptual:
+                loss = loss + args.perceptual * self.perceptual(rgb, few.over(background))
+            return loss
+
+        cut = Cut(g)
+        loss, psnr = cut.views_loss(targets, background, picture_loss) if cut.finite() else (math.nan, math.nan)
+        loss += 0.0 if more is None else float(more.detach())
+        clock.append(time.perf_counter())
+        if math.isfinite(loss):
+            cut.backward(1 / args.accumulate, more)
+        clock.append(time.perf_counter())
+        return (loss, psnr) if math.isfinite(loss) else None
+
+    def scene_loss(self, g: Gaussians4D, truth) -> Tensor | None:
+        """What is asked of the Gaussians themselves: to be where depth has them (less and less of it), and to be
+        no more opaque than they need to (mean opacity)."""
+        more = None
         if truth is not None:
-            weight = args.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
-            loss = loss + weight * geometric(g[: len(truth[0])], *truth)
-        clock.append(time.perf_counter())
-        with torch.no_grad():
-            mse = (rgb - targets.over(background)).square().mean((1, 2, 3)).clamp_min(1e-10)
-            score = float((-10 * torch.log10(mse)).mean())
-        return loss, score, clock
+            weight = self.args.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
+            more = weight * geometric(g[: len(truth[0])], *truth)  # free Gaussians come last
+        if self.args.opacity:
+            more = self.args.opacity * g.opacity.mean() + (0.0 if more is None else more)
+        return more
 
     def pixel_truth(self, inputs, geometry) -> tuple[torch.Tensor, Gaussians4D, torch.Tensor]:
         """For each of the network's Gaussians: the time of its view, what the lift of the renderer's depth says
@@ -190,11 +233,13 @@ class Trainer:
         return view_time[owner], truth.gaussians[piece[owner]], piece[owner] >= 0
 
     def save(self) -> None:
+        if distributed.rank():
+            return
         state = {
             "network": self.network.state_dict(),
             "average": self.average,
-            "optimiser": self.optimiser.state_dict(),
-            "progress": {"step": self.step, "seconds": self.seconds, "skipped": self.skipped},
+            "optimisers": [o.state_dict() for o in self.optimisers],
+            "progress": {k: getattr(self, k) for k in ("step", "seconds", "cpu", "skipped", "bad")},
         }
         tmp = self.state.with_suffix(".tmp")
         torch.save(state, tmp)
@@ -209,7 +254,8 @@ class Trainer:
             state = torch.load(self.state, map_location=self.args.device, weights_only=True)
             self.network.load_state_dict(state["network"])
             self.average = state["average"]
-            self.optimiser.load_state_dict(state["optimiser"])
+            for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+                optimiser.load_state_dict(saved)
         except Exception as e:
             raise InputError(f"{self.state}: this run cannot be resumed ({e}); choose another --out.") from None
         for k, v in state["progress"].items():

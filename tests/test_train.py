@@ -11,9 +11,10 @@ import torch
 
 from timesplat.cli import train_arguments
 from timesplat.datagen.sequence import InputError, read_sequence
-from timesplat.model.data import Clips, choose_inputs, shrink
+from timesplat.model.data import Clips, shrink
 from timesplat.model.losses import geometric, photometric
 from timesplat.model.network import PRESETS, Config
+from timesplat.model.sampling import choose_inputs
 from timesplat.model.train import Trainer, run
 from timesplat.model.views import load_views
 

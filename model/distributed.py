@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Several processes that train one network: `torchrun --nproc-per-node 2 -m timesplat.cli train …`.
+
+Each draws samples of its own, and the gradients are averaged after the backward pass, so that N processes do what
+one does with N times `--accumulate`. gloo between CPUs, NCCL between GPUs. Without torchrun all of it does nothing.
+"""
+
+from __future__ import annotations
+
+import os
+
+import torch
+import torch.distributed as dist
+
+
+def start(device: str) -> str:
+    """Joins the processes that torchrun started; returns the device that this one is to use."""
+    if "WORLD_SIZE" not in os.environ or dist.is_initialized():
+        return device
+    if device.startswith("cuda"):
+        device = f"cuda:{os.environ['LOCAL_RANK']}"
+        torch.cuda.set_device(device)
+    dist.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+    return device
+
+
+def end() -> None:
+    if dist.is_initialized():
+        dist.destroy_process_group()
+
+
+def rank() -> int:
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def size() -> int:
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def wait() -> None:
+    """Until all are here."""
+    if dist.is_initialized():
+        dist.barrier()
+
+
+def average_gradients(network: torch.nn.Module) -> None:
+    """The mean over processes of every gradient, in one message; what has none counts as zero."""
+    if size() == 1:
+        return
+    parameters = list(network.parameters())
+    flat = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in parameters])
+    dist.all_reduce(flat)
+    for p, g in zip(parameters, (flat / size()).split([p.numel() for p in parameters]), strict=True):
+        p.grad = g.view_as(p)
+
+
+def greatest(values: list[float], device: str) -> list[float]:
+    """Of each number the greatest of all processes, so that they agree on time and on stopping."""
+    if size() == 1:
+        return values
+    there = torch.tensor(values, dtype=torch.float64, device=device)
+    dist.all_reduce(there, dist.ReduceOp.MAX)
+    return there.tolist()
