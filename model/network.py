@@ -22,7 +22,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..datagen.sequence import InputError
-from .gaussians import Gaussians4D, isoclinic_rotation, kinematic_from_covariance
+from . import hexplane
+from .gaussians import Gaussians4D, Moving, isoclinic_rotation, kinematic_from_covariance
 from .lift import FEATURES, Geometry
 from .views import Views, pluecker, rays
 
@@ -39,6 +40,12 @@ class Config:
     free: int = 0  # free Gaussian tokens
     time: str = "free"  # of a pixel's Gaussian: free | aligned: its frame's, or where its Geometry has it
 
+    motion: str = "gaussian"  # gaussian | hexplane: 3D Gaussians and a field that moves them (hexplane.py)
+
+    def __post_init__(self) -> None:
+        if self.motion == "hexplane" and (self.source != "predicted" or self.time == "aligned"):
+            raise InputError("hexplane: its Gaussians have no time; it goes with the source predicted and free times.")
+
     @property
     def channels(self) -> int:
         return 10 + (FEATURES if self.source != "predicted" else 0)
@@ -46,7 +53,14 @@ class Config:
     @property
     def outputs(self) -> int:
         """Numbers that define one Gaussian."""
+        if self.motion == "hexplane":
+            return 14  # xyz rgb scale q opacity
         return 20 if self.head == "paper" else 19
+
+    @property
+    def centre(self) -> int:
+        """How many of them, the first, are the centre: xyz, and t where there is one."""
+        return 3 if self.motion == "hexplane" else 4
 
     @property
     def pixel_outputs(self) -> int:
@@ -87,7 +101,7 @@ class Block(nn.Module):
 
 
 class Network(nn.Module):
-    """forward(views, geometry) -> Gaussians4D of one scene."""
+    """forward(views, geometry) -> the Gaussians of one scene."""
 
     def __init__(self, config: Config):
         super().__init__()
@@ -100,17 +114,22 @@ class Network(nn.Module):
         if c.free:
             self.free_tokens = nn.Parameter(torch.randn(c.free, c.width) * 0.02)
             self.decode_free = nn.Linear(c.width, c.outputs)
+        if c.motion == "hexplane":
+            self.plane_tokens = nn.Parameter(torch.randn(hexplane.TOKENS, c.width) * 0.02)
+            self.decode_planes = nn.Linear(c.width, hexplane.CELLS**2 * hexplane.CHANNELS, bias=False)
         for m in self.modules():
             if isinstance(m, nn.Linear):
                 nn.init.normal_(m.weight, std=0.02)
         if c.free:
             nn.init.zeros_(self.decode_free.bias)
-            nn.init.normal_(self.decode_free.weight[:4], std=c.width**-0.5)  # tanh spreads them over the box
+            nn.init.normal_(self.decode_free.weight[: c.centre], std=c.width**-0.5)  # tanh spreads them over the box
+        if c.motion == "hexplane":
+            self.deform = hexplane.make_mlp()
         if c.source != "predicted":
             nn.init.zeros_(self.decode.weight)  # starts as the Geometry itself
             self.fade_free()
 
-    def forward(self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True) -> Gaussians4D:
+    def forward(self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True) -> Gaussians4D | Moving:
         """views: V images, height and width multiples of the patch; geometry: for the sources `sweep` and
         `given`. Pixels in dropped patches, and pixels that own no Gaussian of the
         geometry, yield none."""
@@ -126,14 +145,16 @@ class Network(nn.Module):
         keep = self.kept_patches(views, drop_empty)
         x = patchify(torch.cat(maps, -1), p)[keep]  # (T, p², channels)
         x = self.embed(x.flatten(1))  # (T, D)
-        tokens = len(x)
+        counts = [len(x), c.free, hexplane.TOKENS if c.motion == "hexplane" else 0]
         if c.free:
             x = torch.cat([x, self.free_tokens])
+        if c.motion == "hexplane":
+            x = torch.cat([x, self.plane_tokens])
         x = self.norm_in(x)
         for block in self.blocks:
             x = block(x)
-        x = self.norm_out(x)
-        g = self.decode(x[:tokens]).float().unflatten(-1, (p * p, c.pixel_outputs))  # (T, p², outputs)
+        x, free, planes = self.norm_out(x).split(counts)
+        g = self.decode(x).float().unflatten(-1, (p * p, c.pixel_outputs))  # (T, p², outputs)
         if c.time == "aligned":
             at = torch.zeros_like(time) if geometry is not None else time
             g = torch.cat([g[..., :3], gather_pixels(at, keep, p), g[..., 3:]], -1)
@@ -149,7 +170,10 @@ class Network(nn.Module):
             pixels = (gather_pixels(m, keep, p) for m in (origin, direction))
             out = self.pixel_aligned(g, *pixels).map(lambda m: m.flatten(0, 1))
         if c.free:
-            out = Gaussians4D.cat([out, self.free_gaussians(self.decode_free(x[tokens:]).float())])
+            out = Gaussians4D.cat([out, self.free_gaussians(self.decode_free(free).float())])
+        if c.motion == "hexplane":
+            planes = hexplane.planes_from_tokens(self.decode_planes(planes).float())
+            out = hexplane.Deformed(out, planes, [m.weight for m in self.deform[::2]])
         return out
 
     def free_gaussians(self, g: Tensor) -> Gaussians4D:
@@ -165,7 +189,7 @@ class Network(nn.Module):
         if self.config.free:
             self.decode_free.weight[-1] = 0
             self.decode_free.bias[-1] = FAINT
-            self.decode_free.bias[7:10] = SMALL
+            self.decode_free.bias[self.config.centre + 3 :][:3] = SMALL
 
     def kept_patches(self, views: Views, drop_empty: bool = True) -> Tensor:
         """(P,) bool: the patches that become tokens; with `drop_empty` those that show any foreground."""
@@ -196,13 +220,18 @@ class Network(nn.Module):
 
     def activate(self, g: Tensor) -> Gaussians4D:
         """g (…,outputs) in the order xyz t rgb scale_xyz scale_t, then q_l q_r opacity (paper) or q velocity
-        opacity (kinematic) -> Gaussians with the appendix's activations and biases."""
+        opacity (kinematic) -> Gaussians with the appendix's activations and biases. With a HexPlane xyz rgb
+        scale_xyz q opacity -> Gaussians that do not move, and live for ever."""
+        still = self.config.motion == "hexplane"
+        if still:
+            none = torch.zeros_like(g[..., :1])
+            g = torch.cat([g[..., :3], none, g[..., 3:9], none, g[..., 9:13], none, none, none, g[..., 13:]], -1)
         xyz, t, rgb, s, s_t = g[..., :3], g[..., 3], g[..., 4:7], g[..., 7:10], g[..., 10]
         rgb = 0.5 + 0.28209479177387814 * rgb  # zero-order SH
         scale = torch.exp(s - 2.3).clamp_max(0.3)
-        scale_t = torch.exp(s_t - 2.3).clamp_max(1.0)
+        scale_t = torch.full_like(s_t, 1e6) if still else torch.exp(s_t - 2.3).clamp_max(1.0)
         opacity = torch.sigmoid(g[..., -1] - 2.0)
-        if self.config.head == "kinematic":
+        if self.config.head == "kinematic" or still:
             return Gaussians4D(
                 xyz,
                 t,
