@@ -54,13 +54,14 @@ class Run:
 
 KINEMATIC = {"--head": "kinematic"}
 BRIEF = {"--shrink": 4, "--views": 4, "--targets": 2}
+STILL = {"--static": None, "--views": 4}  # of one moment there are six views
 RUNS = [
     Run("letter", "the paper's letter at this size: the base run"),
     Run("targets", "target views × 2", {"--targets": 8}),
     Run("hexplane", "HexPlane motion", {"--motion": "hexplane"}),
     Run("aligned", "temporal alignment: μ_t is the view's time", {"--time": "aligned"}),
     Run("free", "64 free Gaussians from scratch", {"--free": 64}),
-    Run("static", "initialised from a static (3D) network, half the steps each", first={"--static": None}),
+    Run("static", "initialised from a static (3D) network, half the steps each", first=STILL),
     Run("sweep", "depth swept from the other views, kinematic residual", {"--source": "sweep", **KINEMATIC}),
     Run("given", "depth and motion given, kinematic residual", {"--source": "given", **KINEMATIC}),
     Run("kinematic", "kinematic head", KINEMATIC),

@@ -78,8 +78,8 @@ def panels(count: int, width: float = 4.2, height: float = 3.3):
         "legend.frameon": False,
         "svg.hashsalt": "timesplat",  # the same figure is the same file
     }
-    with plt.rc_context(look):
-        fig, axes = plt.subplots(1, count, figsize=(width * count, height), squeeze=False)
+    plt.rcParams.update(look)
+    fig, axes = plt.subplots(1, count, figsize=(width * count, height), squeeze=False)
     return fig, list(axes[0])
 
 
@@ -108,12 +108,14 @@ def save_picture(image, stem: Path, command: str) -> None:
     import html
     import textwrap
 
+    from matplotlib import get_data_path
     from PIL import Image, ImageDraw, ImageFont
 
+    font = ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSansMono.ttf", 9)
     lines = textwrap.wrap(command, max(image.width // 6, 40), break_long_words=True, break_on_hyphens=False)
     sheet = Image.new("RGB", (image.width, image.height + 12 * len(lines) + 8), "white")
     sheet.paste(image, (0, 0))
-    ImageDraw.Draw(sheet).text((4, image.height + 2), "\n".join(lines), fill="#707070", font=ImageFont.load_default(9))
+    ImageDraw.Draw(sheet).text((4, image.height + 2), "\n".join(lines), fill="#707070", font=font)
     data = io.BytesIO()
     sheet.save(data, "PNG")
     replace(stem.with_name(stem.name + ".png"), data.getvalue())

@@ -286,11 +286,10 @@ def lifetimes(args, command: str) -> None:
                 seen = len({s.seq.views[i].frame for i in chosen})
                 label = f"{setup} ({seen} of {len(s.frames)} frames)"
                 draw_lifetimes(axes, g, len(s.frames), label, n)
-            axes[0].set(xlabel="μ_t (frame)", ylabel="share of Gaussians per frame", title=f"{s.name}, {m.label}")
-            axes[1].set(xlabel="σ_t (frames)", ylabel="share of Gaussians")
-            axes[1].set_xscale("log")
-            axes[0].legend(fontsize=7.5, loc="lower center")
-            axes[1].legend(fontsize=7.5)
+            axes[0].set(xlabel="$\\mu_t$ (frame)", ylabel="share of Gaussians")
+            axes[1].set(xlabel="$\\sigma_t$ (frames)", ylabel="share of Gaussians")
+            for ax in axes:
+                ax.legend(fontsize=7.5, loc="lower left", bbox_to_anchor=(0, 1), title=f"{s.name}, {m.label}")
             save(fig, args.out / f"lifetimes-{s.name.replace('/', '-')}-{m.label}", command)
 
 
@@ -301,17 +300,15 @@ def draw_lifetimes(axes, g, frames: int, label: str, n: int) -> None:
     look = {"color": COLOURS[n], "histtype": "stepfilled", "linewidth": 1.2, "alpha": 0.35}
     edge = look | {"histtype": "step", "alpha": 1.0}
     odd = ((np.round(middle).astype(int) % 2) == 1).mean() if len(middle) else 0.0
-    bins = np.arange(-0.5, frames + 0.25, 0.5)
-    spread = np.geomspace(0.1, 30, 60)
+    bins, spread = np.arange(-0.5, frames + 0.5), np.arange(0, 8.01, 0.2)
     typical = f"{label}: median {np.median(sigma):.2f}" if len(sigma) else label
     for ax, x, edges, text in (
         (axes[0], middle, bins, f"{label}: {odd:.0%} at odd frames"),
         (axes[1], sigma, spread, typical),
     ):
-        x = np.clip(x, edges[0], edges[-1])
-        scale = 2 if ax is axes[0] else 1  # half-frame bins -> per frame
-        ax.hist(x, edges, weights=scale * weight, **look)
-        ax.hist(x, edges, weights=scale * weight, label=text, **edge)
+        x = np.clip(x, edges[0], edges[-1])  # what lies beyond is in the outermost bins
+        ax.hist(x, edges, weights=weight, **look)
+        ax.hist(x, edges, weights=weight, label=text, **edge)
 
 
 def pictures(args, command: str) -> None:

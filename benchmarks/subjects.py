@@ -17,12 +17,13 @@ from timesplat.datagen.rigs import CANONICAL
 from timesplat.datagen.sequence import InputError, Sequence, read_sequence
 from timesplat.model.data import shrink
 from timesplat.model.evaluate import draw
+from timesplat.model.flip import flip
 from timesplat.model.metrics import psnr, psnr_foreground, ssim
 from timesplat.model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
 from timesplat.model.views import Views, load_views
 
 # metric -> its column's title, and decimals
-METRICS = {"psnr": ("PSNR (dB)", 2), "psnr_fg": ("PSNR fg (dB)", 2), "ssim": ("SSIM", 3)}
+METRICS = {"psnr": ("PSNR (dB)", 2), "psnr_fg": ("PSNR fg (dB)", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
 RENDER = "render it with `timesplat render --rig evaluation --targets 1`"
 
 
@@ -149,6 +150,7 @@ def score(subject: Subject, method: Method, inputs: list[int], targets: list[int
         "psnr": psnr(rgb, target),
         "psnr_fg": psnr_foreground(rgb, target, alpha, truth.alpha),
         "ssim": ssim(rgb, target),
+        "flip": flip(rgb, target),
     }
     return {k: [round(x, 5) for x in v.tolist()] for k, v in frames.items()} | {"gaussians": len(g)}
 
