@@ -46,8 +46,10 @@ def run(args: argparse.Namespace) -> int:
     args.device = distributed.start(args.device)
     try:
         clips = load_clips(args)
-        chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free")}
+        chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
         config = replace(PRESETS[args.preset], **chosen)
+        if config.motion == "hexplane" and args.geometric:
+            raise InputError("--geometric compares velocities, and a HexPlane has none; leave it out.")
         torch.manual_seed(args.seed)
         network = Network(config)
         if args.init:
