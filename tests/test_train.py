@@ -169,3 +169,25 @@ def test_damaged_run_is_refused(sphere_folder, tmp_path):
     (tmp_path / "run" / "state.pt").write_bytes(b"not a run")
     with pytest.raises(InputError, match="cannot be resumed"):
         run(arguments(sphere_folder.parent, tmp_path / "run", "--steps", "1"))
+
+
+def test_checkpointing_keeps_less_and_changes_nothing(trainer):
+    """The same gradients, from fewer bytes kept for the backward pass."""
+    found = []
+    for words in ((), ("--checkpointing",)):
+        t = trainer(*words)
+        t.network.train()
+        rng = np.random.default_rng(0)
+        sample = t.clips.sample(rng, 2, 4)
+        kept = [0]
+
+        def pack(x, kept=kept):
+            kept[0] += x.nbytes
+            return x
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
+            assert t.learn(sample, rng, []) is not None
+        found.append(({k: p.grad for k, p in t.network.named_parameters()}, kept[0]))
+    (plain, more), (checkpointed, less) = found
+    torch.testing.assert_close(checkpointed, plain, rtol=1e-5, atol=1e-7)
+    assert less < more
