@@ -192,55 +192,105 @@ def save_blend(asset: Path, out: Path) -> None:
 
 
 def evaluate_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("assets", nargs="+", help="animated files, folders of them, or zoo:SEED")
-    p.add_argument("--setup", choices=["alternating", "interpolation", "rotating", "random"], default="alternating")
-    p.add_argument("--size", type=int, default=128, help="pixels, a multiple of 8 (default: 128)")
+    p.add_argument("assets", nargs="+", help="animated files, zoo:SEED, rendered Sequences, or folders of either")
+    p.add_argument("--setup", default="alternating", help="comma-separated: alternating, interpolation, rotating, "
+                   "random (all: these four), video, canonical, random-N, views-N (default: alternating)")  # fmt: skip
+    p.add_argument("--size", default="128", help="comma-separated pixels, multiples of 8 (default: 128); rendered "
+                   "at the largest, the others are whole fractions of it")  # fmt: skip
+    p.add_argument("--protocol", choices=["paper"], help="score four canonical and a random view a frame also for one "
+                   "setup and size, not the held-out views alone")  # fmt: skip
+    p.add_argument("--stride", default="1", help="score every Nth frame; one number, or one for each size (default: 1)")
     p.add_argument("--samples", type=int, default=16, help="Cycles samples (default: 16)")
     p.add_argument("--methods", default="white,hull,lift,guided,sweep,predicted,rgb", help="comma-separated")
     p.add_argument("--checkpoint", type=Path, help="weights for the one network method named")
-    p.add_argument("--out", type=Path, required=True, help="folder for renders, metrics.json and metrics.md")
-    p.add_argument("--jobs", type=int, default=2, help="renders in parallel (default: 2)")
+    p.add_argument("--out", type=Path, required=True, help="folder for renders, metrics.json, tables.md, tables.csv")
+    p.add_argument("--jobs", type=int, default=2, help="processes, one core each (default: 2)")
+    p.add_argument("--seconds", type=float, help="start no reconstruction after this long; the same command goes on")
+    p.add_argument("--no-lpips", dest="lpips", action="store_false", help="leave LPIPS out even if it has weights")
     p.add_argument("--seed", type=int, default=0)
 
 
 def evaluate(args: argparse.Namespace) -> int:
-    """Render what is not yet rendered, reconstruct with each method, score held-out views."""
+    """Render what is not yet rendered, reconstruct with each method, score, write tables in the paper's layout."""
+    import time
+
+    from .datagen.render import Settings
+    from .datagen.rigs import SETUPS
+    from .model.evaluate import evaluate_folders, find_sequences
+    from .model.lpips import HINT, LPIPS
+    from .model.protocol import TABLE, check_setup
+
+    methods, sizes, stride = check_methods(args.methods), numbers("--size", args.size), numbers("--stride", args.stride)
+    names = ",".join(TABLE) if args.setup == "all" else args.setup
+    setups = list(dict.fromkeys(check_setup(s.strip()) for s in names.split(",")))
+    if len(stride) not in (1, len(sizes)):
+        raise InputError(f"--stride {args.stride}: give one number, or one for each of the {len(sizes)} sizes.")
+    if args.jobs < 1:
+        raise InputError(f"--jobs {args.jobs}: give 1 or more.")
+    several = len(setups) > 1 or len(sizes) > 1 or args.protocol == "paper"
+    rig = "evaluation" if several or setups[0] not in SETUPS else setups[0]
+    settings = Settings(rig=rig, targets=1, size=max(sizes), samples=args.samples, seed=args.seed)
+
+    sequences, others = find_sequences(args.assets)
+    rendered = bool(sequences)
+    failures = render_into(args.out / "renders" / rig, others, settings, args.jobs, sequences)
+    if not sequences:
+        raise InputError(f"{args.assets[0]}: nothing to evaluate; none of the assets could be rendered.")
+    if args.lpips and not LPIPS.find():
+        print(HINT, file=sys.stderr)
+    evaluate_folders(
+        sequences,
+        methods,
+        args.out,
+        args.checkpoint,
+        command=f"timesplat evaluate {' '.join(args.assets)} --setup {args.setup} --size {args.size} "
+        f"--stride {args.stride} --methods {args.methods} --out {args.out}"
+        + (f" --checkpoint {args.checkpoint}" if args.checkpoint else ""),
+        setups=tuple(setups),
+        sizes=tuple(sorted(sizes)),
+        stride=tuple(n for _, n in sorted(zip(sizes, stride * len(sizes), strict=False))),
+        lpips=args.lpips,
+        deadline=time.time() + args.seconds if args.seconds is not None else float("inf"),
+        jobs=min(args.jobs, len(setups) * len(sequences)) if several or rendered else 1,
+    )
+    return 2 if failures else 0
+
+
+def render_into(folder: Path, assets: list[str], settings, jobs: int, sequences: dict) -> list[str]:
+    """Renders what is not yet rendered, adds it to `sequences` by name, returns what failed."""
     from tqdm import tqdm
 
-    from .datagen.render import Settings, render_assets
+    from .datagen.render import render_assets
     from .datagen.sequence import read_sequence
-    from .model.evaluate import evaluate_folders
 
-    methods = check_methods(args.methods)
-    settings = Settings(rig=args.setup, targets=1, size=args.size, samples=args.samples, seed=args.seed)
+    if not assets:
+        return []
     with tqdm(total=0, desc="rendering", unit="object", disable=None) as bar:
 
         def progress(done: int, total: int, images: int) -> None:
             bar.total, bar.n = total, done
             bar.refresh()
 
-        folders, failures = render_assets(
-            args.assets,
-            args.out / "renders" / args.setup,
-            settings,
-            jobs=args.jobs,
-            report=bar.write,
-            progress=progress,
-        )
-    if not folders:
-        raise InputError(f"{args.assets[0]}: nothing to evaluate; none of the assets could be rendered.")
-    evaluate_folders({f.parent.name: read_sequence(f) for f in sorted(folders)}, methods, args.out, args.checkpoint)
-    return 2 if failures else 0
+        made, failures = render_assets(assets, folder, settings, jobs=jobs, report=bar.write, progress=progress)
+    sequences |= {f.parent.name: read_sequence(f) for f in sorted(made)}
+    return failures
+
+
+def numbers(option: str, text: str) -> list[int]:
+    """Comma-separated whole numbers above 0. Raises InputError."""
+    parts = [p.strip() for p in text.split(",")]
+    if not all(p.isdigit() and int(p) > 0 for p in parts):
+        raise InputError(f"{option} {text}: give numbers above 0, with commas between them.")
+    return [int(p) for p in parts]
 
 
 def check_methods(text: str) -> list[str]:
     """A comma-separated list of methods. Raises InputError naming the unknown one and those there are."""
-    from .model.reconstruct import METHODS
+    from .model.evaluate import parse_method
 
     methods = [m.strip() for m in text.split(",") if m.strip()]
     for m in methods:
-        if m not in METHODS:
-            raise InputError(f"{m}: no such method; choose from {', '.join(METHODS)}.")
+        parse_method(m)
     return methods
 
 

@@ -1,14 +1,17 @@
 """The instrument: what metrics.json holds, and that its figures are those of the pictures."""
 
 import json
+import re
+import shutil
 
-import numpy as np
 import pytest
 import torch
 
-from timesplat.datagen.sequence import read_sequence
-from timesplat.model.evaluate import COLUMNS, collect, draw, evaluate_folders, evaluate_method, summarise, table
+from timesplat.datagen.sequence import InputError, read_sequence
+from timesplat.model import evaluate
+from timesplat.model.evaluate import draw, evaluate_folders, evaluate_method, load_inputs, load_truth, parse_method
 from timesplat.model.metrics import psnr
+from timesplat.model.tables import COLUMNS
 from timesplat.model.views import load_views
 
 
@@ -45,13 +48,106 @@ def test_white_scores_what_the_silhouette_says(sphere_folder):
     assert row["psnr"] == pytest.approx(float(expected), abs=1e-5)
 
 
-def test_means_are_over_views_and_percentiles_over_all():
-    def rows(values):
-        frames = {"psnr": values, "psnr_fg": values, "ssim": values}
-        return {"m": summarise(frames) | {"seconds": 1.0, "gaussians": 2, "gaussians_kept": 1, "frames": frames}}
+class Frozen:
+    """A scene that is not Gaussians4D: the state of another at each time."""
 
-    m = collect({"a": rows([10.0, 20.0]), "b": rows([30.0, 40.0])})
-    assert m["methods"]["m"]["psnr"] == 25 and m["methods"]["m"]["psnr_worst"] == 10
-    assert m["methods"]["m"]["psnr_p5"] == pytest.approx(np.percentile([10, 20, 30, 40], 5))
-    assert m["objects"]["b"]["m"]["psnr"] == 35
-    assert table(m).count("\n") == 2
+    def __init__(self, g):
+        self.g = g
+
+    def __len__(self):
+        return len(self.g)
+
+    def __getitem__(self, index):
+        return Frozen(self.g[index])
+
+    def alive(self):
+        return self.g.alive()
+
+    def at(self, t):
+        return self.g.frozen(t)
+
+
+def test_other_moving_scenes_are_scored_as_well(sphere_folder, monkeypatch):
+    seq = read_sequence(sphere_folder)
+    targets = seq.select(rig="target")
+    row, _ = evaluate_method(seq, "lift", list(range(24)), targets)
+    plain = evaluate.reconstruct_views
+    monkeypatch.setattr(evaluate, "reconstruct_views", lambda *a, **k: Frozen(plain(*a, **k)))
+    moving, scene = evaluate_method(seq, "lift", list(range(24)), targets)
+    assert isinstance(scene, Frozen) and moving["psnr"] == pytest.approx(row["psnr"], abs=0.05)
+
+
+def test_smaller_sizes_are_averages(sphere_folder):
+    seq = read_sequence(sphere_folder)
+    targets = seq.select(rig="target")
+    truth, half = load_truth(seq, targets, targets), load_truth(seq, targets, targets[:1], 16)
+    assert half.picture.shape == (6, 16, 16, 3) and half.novel.tolist() == [True] + [False] * 5
+    blocks = truth.picture.reshape(6, 16, 2, 16, 2, 3).mean((2, 4))
+    assert torch.allclose(half.picture, blocks, atol=1e-6)
+    assert torch.allclose(half.views.intrinsics * 2, truth.views.intrinsics)
+    with_passes, without = (load_inputs(seq, range(24), passes, 16) for passes in (True, False))
+    assert torch.equal(with_passes.rgb, without.rgb) and without.depth is None and with_passes.depth is not None
+    assert torch.allclose(without.over(1.0), load_truth(seq, range(24), [], 16).picture, atol=1e-5)
+    with pytest.raises(InputError, match="do not shrink to 20"):
+        load_inputs(seq, range(24), False, 20)
+
+
+def test_method_specs():
+    assert parse_method(" lift").passes and not parse_method("sweep").passes
+    for spec, says in (("magic", "no such method"), ("lift+fast", "not an option"), ("lift+budget:x", "not an option")):
+        with pytest.raises(InputError, match=says):
+            parse_method(spec)
+
+
+@pytest.fixture
+def folders(sphere_folder, tmp_path):
+    """Two objects with one Sequence each, and a half-written one."""
+    for name in ("a/line", "b/line", "b/.line.tmp"):
+        copy = shutil.copytree(sphere_folder, tmp_path / "data" / name) / "transforms.json"
+        if name == "b/line":
+            copy.write_text(copy.read_text() + " ")  # not the same Sequence
+    return tmp_path / "data"
+
+
+def test_finished_sequences_are_found(folders, tmp_path):
+    sequences, others = evaluate.find_sequences([str(folders), "fox.glb"])
+    assert list(sequences) == ["a", "b"] and others == ["fox.glb"]
+    shutil.copytree(folders / "a" / "line", folders / "a" / "turn")
+    assert list(evaluate.find_sequences([str(folders)])[0]) == ["a/line", "a/turn", "b"]
+
+
+PLAN = {"setups": ("", "alternating"), "sizes": (16, 32), "stride": (8, 4)}
+
+
+def test_many_runs_go_on_where_they_were(folders, tmp_path, monkeypatch):
+    for f in folders.glob("?/line/transforms.json"):
+        f.write_text(re.sub(r'"rig": "(?!target)\w*"', '"rig": "alternating"', f.read_text()))
+    sequences, _ = evaluate.find_sequences([str(folders)])
+    out = tmp_path / "out"
+    first = evaluate_folders(sequences, ["white", "lift"], out, command="timesplat evaluate x", **PLAN)
+    assert set(first["setups"]) == set(PLAN["setups"]) and set(first["setups"][""]) == {"16", "32"}
+    lines = (out / "rows.jsonl").read_text().splitlines()
+    assert len(lines) == 2 * 2 * 2 * 2
+    text = (out / "tables.md").read_text()
+    assert text.startswith("`timesplat evaluate x`\n") and (out / "tables.csv").read_text().startswith("# timesplat e")
+
+    (out / "rows.jsonl").write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:50])
+    made = []
+    plain = evaluate.evaluate_views
+    monkeypatch.setattr(evaluate, "evaluate_views", lambda *a: made.append(a[1]) or plain(*a))
+    second = evaluate_folders(sequences, ["white", "lift"], out, command="timesplat evaluate x", **PLAN)
+    assert len(made) == 1
+    for setup in PLAN["setups"]:
+        for size in ("16", "32"):
+            a, b = (m["setups"][setup][size]["methods"]["lift"]["psnr"] for m in (first, second))
+            assert a == b
+    with pytest.raises(InputError, match="more seconds"):
+        evaluate_folders(sequences, ["hull"], out, deadline=0)
+
+
+def test_processes_give_the_same(folders, tmp_path):
+    sequences, _ = evaluate.find_sequences([str(folders)])
+    one = evaluate_folders(sequences, ["lift"], tmp_path / "one")
+    two = evaluate_folders(sequences, ["lift"], tmp_path / "two", jobs=2)
+    assert one["methods"]["lift"]["psnr"] == pytest.approx(two["methods"]["lift"]["psnr"], abs=1e-4)
+    assert two["jobs"] == 2 and list(two["objects"]) == ["a", "b"]
