@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from ..datagen.sequence import InputError
 from . import hexplane
@@ -103,6 +104,8 @@ class Block(nn.Module):
 class Network(nn.Module):
     """forward(views, geometry) -> the Gaussians of one scene."""
 
+    checkpointing = False  # in training, keep only the blocks' inputs and compute the rest again going backward
+
     def __init__(self, config: Config):
         super().__init__()
         self.config = c = config
@@ -137,14 +140,15 @@ class Network(nn.Module):
         height, width = views.size
         if height % p or width % p:
             raise ValueError(f"images are {width}x{height}: width and height must be multiples of {p}")
-        origin, direction = rays(views.c2w, views.intrinsics, height, width)
-        time = views.time[:, None, None, None].expand(*views.alpha.shape, 1)
-        maps = [2 * views.over(1.0) - 1, time, pluecker(origin, direction)]
-        if geometry is not None:
-            maps.append(geometry.features)
         keep = self.kept_patches(views, drop_empty)
-        x = patchify(torch.cat(maps, -1), p)[keep]  # (T, p², channels)
-        x = self.embed(x.flatten(1))  # (T, D)
+        alpha = gather_pixels(views.alpha[..., None], keep, p)
+        colour = gather_pixels(views.rgb, keep, p) * alpha + (1 - alpha)  # over white
+        origin, direction = patch_rays(views, keep, p)
+        time = gather_pixels(views.time[:, None, None, None].expand(*views.alpha.shape, 1), keep, p)
+        maps = [2 * colour - 1, time, pluecker(origin, direction)]
+        if geometry is not None:
+            maps.append(gather_pixels(geometry.features, keep, p))
+        x = self.embed(torch.cat(maps, -1).flatten(1))  # (T, p²·channels) -> (T, D)
         counts = [len(x), c.free, hexplane.TOKENS if c.motion == "hexplane" else 0]
         if c.free:
             x = torch.cat([x, self.free_tokens])
@@ -152,23 +156,19 @@ class Network(nn.Module):
             x = torch.cat([x, self.plane_tokens])
         x = self.norm_in(x)
         for block in self.blocks:
-            x = block(x)
+            x = checkpoint(block, x, use_reentrant=False) if self.checkpointing and self.training else block(x)
         x, free, planes = self.norm_out(x).split(counts)
         g = self.decode(x).float().unflatten(-1, (p * p, c.pixel_outputs))  # (T, p², outputs)
         if c.time == "aligned":
             at = torch.zeros_like(time) if geometry is not None else time
-            g = torch.cat([g[..., :3], gather_pixels(at, keep, p), g[..., 3:]], -1)
+            g = torch.cat([g[..., :3], at, g[..., 3:]], -1)
 
         if geometry is not None:
             row = self.rows(views, keep)[geometry.owner]  # (M,) which of the outputs is about which Gaussian
-
-            def mine(m: Tensor) -> Tensor:
-                return m.reshape(-1, *m.shape[3:])[geometry.owner]
-
-            out = self.residual(g.flatten(0, 1)[row], geometry.gaussians, mine(direction), mine(geometry.slack))
+            slack = geometry.slack.flatten()[geometry.owner]
+            out = self.residual(g.flatten(0, 1)[row], geometry.gaussians, direction.flatten(0, 1)[row], slack)
         else:
-            pixels = (gather_pixels(m, keep, p) for m in (origin, direction))
-            out = self.pixel_aligned(g, *pixels).map(lambda m: m.flatten(0, 1))
+            out = self.pixel_aligned(g, origin, direction).map(lambda m: m.flatten(0, 1))
         if c.free:
             out = Gaussians4D.cat([out, self.free_gaussians(self.decode_free(free).float())])
         if c.motion == "hexplane":
@@ -193,7 +193,7 @@ class Network(nn.Module):
 
     def kept_patches(self, views: Views, drop_empty: bool = True) -> Tensor:
         """(P,) bool: the patches that become tokens; with `drop_empty` those that show any foreground."""
-        seen = patchify(views.alpha[..., None], self.config.patch).amax((1, 2)) > 0
+        seen = patches(views.alpha, self.config.patch).amax((2, 4)).flatten() > 0
         return seen if drop_empty else torch.ones_like(seen)
 
     def rows(self, views: Views, keep: Tensor) -> Tensor:
@@ -296,14 +296,23 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
+def patches(m: Tensor, p: int) -> Tensor:
+    """(V,H,W,…) -> (V, H/p, p, W/p, p, …), a view."""
+    return m.unflatten(2, (-1, p)).unflatten(1, (-1, p))
+
+
 def gather_pixels(m: Tensor, keep: Tensor, p: int) -> Tensor:
-    """m (V,H,W,…), keep (P,) bool with T patches kept -> (T, p², …), the order of the network's Gaussians."""
-    patches = patchify(m.reshape(*m.shape[:3], -1), p)[keep]
-    return patches.reshape(*patches.shape[:2], *m.shape[3:])
+    """m (V,H,W,…), keep (P,) bool with T patches kept -> (T, p², …): patches view by view and row by row, pixels
+    row by row within; the order of the network's Gaussians."""
+    m = patches(m, p)
+    view, i, j = keep.reshape(len(m), m.shape[1], m.shape[3]).nonzero(as_tuple=True)
+    return m[view, i, :, j].flatten(1, 2)
 
 
-def patchify(x: Tensor, p: int) -> Tensor:
-    """(V,H,W,C) -> (V·H/p·W/p, p², C), patches row by row, pixels row by row within."""
-    V, H, W, C = x.shape
-    x = x.reshape(V, H // p, p, W // p, p, C).permute(0, 1, 3, 2, 4, 5)
-    return x.reshape(-1, p * p, C)
+def patch_rays(views: Views, keep: Tensor, p: int) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions (T,p²,3) of the kept patches' pixels: every patch a small image of its own."""
+    height, width = views.size
+    view, i, j = keep.reshape(len(views), height // p, width // p).nonzero(as_tuple=True)
+    corner = torch.stack([0 * i, 0 * i, j * p, i * p], -1)
+    found = rays(views.c2w[view], views.intrinsics[view] - corner, p, p)
+    return tuple(m.flatten(1, 2) for m in found)

@@ -5,7 +5,7 @@ import torch
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.lift import lift_geometry
-from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patchify
+from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patch_rays
 from timesplat.model.sweep import sweep_geometry
 from timesplat.model.views import rays
 
@@ -170,11 +170,34 @@ def test_gradients_reach_every_weight(views):
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
 
 
-def test_patchify_keeps_rows_and_columns():
-    x = torch.arange(2 * 4 * 6).reshape(2, 4, 6, 1)
-    p = patchify(x, 2)
-    assert p.shape == (2 * 2 * 3, 4, 1)
-    assert p[1, :, 0].tolist() == [2, 3, 8, 9]  # first row of patches, second column
+def test_checkpointing_changes_no_gradient(views):
+    gradients = []
+    for checkpointing in (False, True):
+        torch.manual_seed(0)
+        net = Network(Config(**TINY))
+        net.checkpointing = checkpointing
+        net(views).xyz.square().sum().backward()
+        gradients.append([p.grad for p in net.parameters()])
+    for a, b in zip(*gradients, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_pixels_are_gathered_patch_by_patch():
+    x = torch.arange(2 * 4 * 6).reshape(2, 4, 6)
+    keep = torch.ones(2 * 2 * 3, dtype=torch.bool)
+    got = gather_pixels(x, keep, 2)
+    assert got.shape == (2 * 2 * 3, 4)
+    assert got[1].tolist() == [2, 3, 8, 9]  # first row of patches, second column
+    keep[0] = False
+    assert torch.equal(gather_pixels(x[..., None], keep, 2), got[1:, :, None])
+
+
+def test_rays_of_patches_are_those_of_the_pictures(views):
+    keep = Network(Config(**TINY)).kept_patches(views)
+    assert 0 < keep.sum() < len(keep)
+    whole = rays(views.c2w, views.intrinsics, *views.size)
+    for a, b in zip(patch_rays(views, keep, 8), whole, strict=True):
+        torch.testing.assert_close(a, gather_pixels(b, keep, 8), atol=1e-6, rtol=0)
 
 
 def test_odd_image_size_is_refused(spheres):
@@ -194,7 +217,7 @@ def test_rows_lead_from_pixels_to_outputs(views):
     net = Network(Config(**TINY))
     keep = net.kept_patches(views)
     row = net.rows(views, keep)
-    number = torch.arange(3 * 32 * 32).reshape(3, 32, 32, 1)
-    order = patchify(number, 8)[keep].flatten()
+    number = torch.arange(3 * 32 * 32).reshape(3, 32, 32)
+    order = gather_pixels(number, keep, 8).flatten()
     assert torch.equal(order[row[row >= 0]], (row >= 0).nonzero()[:, 0])
     assert (row < 0).sum() == (~keep).sum() * 64
