@@ -8,6 +8,7 @@ one does with N times `--accumulate`. gloo between CPUs, NCCL between GPUs. With
 from __future__ import annotations
 
 import os
+from datetime import timedelta
 
 import torch
 import torch.distributed as dist
@@ -20,7 +21,8 @@ def start(device: str) -> str:
     if device.startswith("cuda"):
         device = f"cuda:{os.environ['LOCAL_RANK']}"
         torch.cuda.set_device(device)
-    dist.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+    patience = timedelta(hours=12)  # while the first packs the clips
+    dist.init_process_group("nccl" if device.startswith("cuda") else "gloo", timeout=patience)
     return device
 
 

@@ -46,15 +46,9 @@ def run(args: argparse.Namespace) -> int:
     args.device = distributed.start(args.device)
     try:
         clips = load_clips(args)
-        chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
-        config = replace(PRESETS[args.preset], **chosen)
-        if config.motion == "hexplane" and args.geometric:
-            raise InputError("--geometric compares velocities, and a HexPlane has none; leave it out.")
-        torch.manual_seed(args.seed)
-        network = Network(config)
-        if args.init:
-            load_matching(network, load_network(args.init))
-        Trainer(network.to(args.device), clips, args).run()
+        if not distributed.rank():
+            print(clips)
+        Trainer(make_network(args).to(args.device), clips, args).run()
     finally:
         distributed.end()
     return 0
@@ -67,8 +61,19 @@ def load_clips(args: argparse.Namespace) -> Clips:
     clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix)
     if not distributed.rank():
         distributed.wait()
-        print(clips)
     return clips
+
+
+def make_network(args: argparse.Namespace) -> Network:
+    """With random weights by the seed, or those of --init."""
+    chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
+    if args.motion == "hexplane" and args.geometric:
+        raise InputError("--geometric compares velocities, and a HexPlane has none; leave it out.")
+    torch.manual_seed(args.seed)
+    network = Network(replace(PRESETS[args.preset], **chosen))
+    if args.init:
+        load_matching(network, load_network(args.init))
+    return network
 
 
 class Trainer:
@@ -156,9 +161,9 @@ class Trainer:
         results = []
         for n in range(args.accumulate):
             rng = np.random.default_rng((args.seed, self.step, distributed.rank() * args.accumulate + n))
-            clock = [time.perf_counter()]
+            clock = [self.now()]
             sample = self.clips.sample(rng, self.targets, self.views)
-            clock.append(time.perf_counter())
+            clock.append(self.now())
             results.append(self.learn(sample, rng, clock))
             data, geometry, forward, raster, backward = np.diff(clock)
             shares += [data, geometry, forward + backward, raster]
@@ -183,11 +188,11 @@ class Trainer:
             truth = [x.to(args.device) for x in self.pixel_truth(sample.inputs, geometry)]
         inputs, targets = sample.inputs.to(args.device), sample.targets.to(args.device)
         geometry = geometry and geometry.to(args.device)
-        clock.append(time.perf_counter())
+        clock.append(self.now())
         with torch.autocast(args.device.split(":")[0], torch.bfloat16, enabled=args.bf16):
             g = network(inputs, geometry)
         more = self.scene_loss(g, truth)
-        clock.append(time.perf_counter())
+        clock.append(self.now())
         colour = rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.ones(3)
         background = torch.tensor(colour).float().to(args.device)
 
@@ -200,11 +205,17 @@ class Trainer:
         cut = Cut(g)
         loss, psnr = cut.views_loss(targets, background, picture_loss) if cut.finite() else (math.nan, math.nan)
         loss += 0.0 if more is None else float(more.detach())
-        clock.append(time.perf_counter())
+        clock.append(self.now())
         if math.isfinite(loss):
             cut.backward(1 / args.accumulate, more)
-        clock.append(time.perf_counter())
+        clock.append(self.now())
         return (loss, psnr) if math.isfinite(loss) else None
+
+    def now(self) -> float:
+        """Seconds, once the device has done what it was given."""
+        if self.args.device.startswith("cuda"):
+            torch.cuda.synchronize()
+        return time.perf_counter()
 
     def scene_loss(self, g: Gaussians4D, truth) -> Tensor | None:
         """What is asked of the Gaussians themselves: to be where depth has them (less and less of it), and to be
