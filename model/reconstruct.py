@@ -26,6 +26,7 @@ METHODS = {
     "predicted": "the paper's network over RGB, token dropping on",
     "gs-lrm-frame": "after GS-LRM: our network trained without time, each frame from its own views alone",
     "gs-lrm-all": "after GS-LRM: our network trained without time, all views taken for one moment",
+    "4dgs": "after 4DGS: 4D Gaussians fitted to the views from random points, for some seconds",
 }
 NEEDS_PASSES = {"lift", "guided"}
 # The checkpoint of a method that does not have one of its own name.
@@ -45,9 +46,11 @@ def reconstruct(
     device: str = "cpu",
     checkpoint: Path | None = None,
     progress=None,
+    seconds: float = 10.0,
 ) -> Gaussians4D | Moving:
     """Views `indices` of the Sequence (all of them by default) -> the scene, Gaussians filtered out that the
-    paper's inference filters would never draw. `progress(fraction, text)` is called between steps.
+    paper's inference filters would never draw. `progress(fraction, text)` is called between steps; `seconds`
+    is what methods that fit a scene may take.
 
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint."""
     report = progress or (lambda fraction, text: None)
@@ -60,14 +63,20 @@ def reconstruct(
         raise InputError(f"{sequence.root}: no view shows the object; check the cameras and the alpha channel.")
     report(0.3, f"reconstructing ({method})")
     with torch.inference_mode():
-        g = reconstruct_views(views, method, device, checkpoint)
+        fit = progress and (lambda fraction, text: report(0.3 + 0.7 * fraction, text))
+        g = reconstruct_views(views, method, device, checkpoint, seconds, fit)
     return g[g.alive()]
 
 
 def reconstruct_views(
-    views: Views, method: str, device: str = "cpu", checkpoint: Path | None = None
+    views: Views,
+    method: str,
+    device: str = "cpu",
+    checkpoint: Path | None = None,
+    seconds: float = 10.0,
+    progress=None,
 ) -> Gaussians4D | Moving:
-    """The same from tensors; unfiltered."""
+    """The same from tensors; unfiltered. `seconds` and `progress` are for methods that fit a scene."""
     if method in ("white", "hull"):
         from .baselines import hull
 
@@ -76,6 +85,11 @@ def reconstruct_views(
         from .lift import lift
 
         return lift(views)
+    if method == "4dgs":
+        from .baselines.four_dgs import four_dgs
+
+        check_device(device)
+        return four_dgs(views, device, seconds, progress=progress)
     network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
 
     def run(views: Views) -> Gaussians4D:

@@ -1,10 +1,14 @@
 """The baselines: what each sees of the input, and that optimisation earns its seconds."""
 
+import time
+
 import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError
+from timesplat.model.baselines.four_dgs import four_dgs
 from timesplat.model.baselines.gs_lrm import all_in, per_frame
+from timesplat.model.metrics import psnr
 from timesplat.model.network import Config, Network
 from timesplat.model.rasterize import render
 from timesplat.model.reconstruct import reconstruct_views, save_network
@@ -80,3 +84,38 @@ def test_per_frame_of_nothing_and_all_in_of_one(spheres):
     assert len(g) == 1 and g.alive().all()
     views.alpha[:] = 0
     assert len(per_frame(views, paint)) == len(per_frame(views, paint).at(0.3)) == 0
+
+
+@pytest.fixture(scope="module")
+def moving(spheres):
+    """Input views of the moving spheres, and held-out ones."""
+    frames = list(range(24))
+    return spheres(frames, size=32), spheres(frames[3::6], [(45, 20), (200, -10), (120, 30), (300, 10)], size=32)
+
+
+def quality(scene, views):
+    scene = scene[scene.alive()]
+    rgb, _ = render(scene, views.c2w, views.intrinsics, views.time, *views.size, inference=True)
+    return float(psnr(rgb, views.over(1.0)).mean())
+
+
+def test_4dgs_learns_from_random_points(moving):
+    inputs, held_out = moving
+    with torch.inference_mode():
+        white, start = quality(reconstruct_views(inputs, "white"), held_out), four_dgs(inputs, steps=0)
+        g = four_dgs(inputs, steps=120)
+    assert len(start) == 8000 and quality(start, held_out) < white
+    assert quality(g, inputs) > white + 8 and quality(g, held_out) > white + 4
+    assert not g.xyz.requires_grad
+
+
+def test_a_number_of_steps_gives_the_same_on_every_run_and_seconds_end(moving):
+    views = moving[0]
+    a, b = four_dgs(views, steps=6), four_dgs(views, steps=6)
+    torch.testing.assert_close(a.xyz, b.xyz, rtol=0, atol=0)
+    torch.testing.assert_close(a.opacity, b.opacity, rtol=0, atol=0)
+    told = []
+    start = time.perf_counter()
+    reconstruct_views(views, "4dgs", seconds=0.3, progress=lambda fraction, text: told.append(fraction))
+    assert time.perf_counter() - start < 5
+    assert told == sorted(told) and told[-1] == 1
