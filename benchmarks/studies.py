@@ -60,6 +60,9 @@ def main(argv: list[str] | None = None) -> int:
             sub.add_argument(words, **options)
     args = p.parse_args(argv)
     try:
+        if args.study != "training":
+            args.methods = methods(args.methods)
+            args.subjects = subjects(args.folders, args.size)
         args.run(args, command_line("timesplat.benchmarks.studies", argv))
     except InputError as e:
         print(f"studies: {e}", file=sys.stderr)
@@ -67,6 +70,11 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("studies: stopped; what is scored is kept, and the same command goes on.", file=sys.stderr)
         return 130
+    except ModuleNotFoundError as e:
+        if e.name != "matplotlib":
+            raise
+        print("studies: matplotlib is not installed; pip install 'timesplat[figures]'.", file=sys.stderr)
+        return 2
     return 0
 
 
@@ -81,12 +89,12 @@ def scored(args, study: str, conditions: list, choose: Callable, targets: Callab
     """Every method on every object in every condition -> {(condition, label): [scores per object]}.
     choose(subject, condition) and targets(subject, condition) give indices of views, or a list of such lists
     (moments, each reconstructed alone, whose scores are joined)."""
-    found, wanted, scores = subjects(args.folders, args.size), methods(args.methods), Scores(args.out / "scores.json")
-    plan = [(s, c, choose(s, c), targets(s, c)) for s in found for c in conditions]  # bad input shows at once
+    scores = Scores(args.out / "scores.json")
+    plan = [(s, c, choose(s, c), targets(s, c)) for s in args.subjects for c in conditions]  # bad input shows at once
     out: dict = {}
-    bar = tqdm(total=len(plan) * len(wanted), desc=study, unit="run", disable=None)
+    bar = tqdm(total=len(plan) * len(args.methods), desc=study, unit="run", disable=None)
     for s, c, inputs, held_out in plan:
-        for m in wanted:
+        for m in args.methods:
             bar.set_postfix_str(f"{s.name} {m.label} {c}")
             parts = zip(inputs, held_out, strict=True) if still else [(inputs, held_out)]
             rows = [scores.of(study, s, m, i, t, still) for i, t in parts]
@@ -125,7 +133,7 @@ def cells(rows: list[dict]) -> list[str]:
 
 
 def about(args, what: str) -> str:
-    names = [s.name for s in subjects(args.folders, args.size)]
+    names = [s.name for s in args.subjects]
     return (
         f"{what} Mean ± standard error over {len(names)} objects ({', '.join(names)}), {args.size}², over white; fg: "
         "over the pixels that show the object."
@@ -169,7 +177,7 @@ def training(args, command: str) -> None:
 def views(args, command: str) -> None:
     """Scaling of inference: random views, spread over the clip; scored on four canonical and a random view a frame."""
     result = scored(args, "views", args.counts, lambda s, n: protocol.inputs(s.seq, f"views-{n}"), paper_views)
-    labels = [m.label for m in methods(args.methods)]
+    labels = [m.label for m in args.methods]
     fig, axes = panels(len(METRICS) - 1)
     for ax, metric in zip(axes, [m for m in METRICS if m != "psnr_fg"], strict=True):
         for n, label in enumerate(labels):
@@ -199,7 +207,7 @@ def views_per_frame(args, command: str) -> None:
     head += ["paper: Objaverse4D PSNR / SSIM", "Consistent4D PSNR / SSIM"]
     rows = []
     for c in conditions:
-        rows += [[*c, m.label, *cells(result[c, m.label]), "", ""] for m in methods(args.methods)]
+        rows += [[*c, m.label, *cells(result[c, m.label]), "", ""] for m in args.methods]
         for (*where, model), sets in paper.VIEWS_PER_FRAME.items():
             if tuple(where) == c:
                 rows.append([*c, f"paper's {model}", *[""] * len(METRICS), *(f"{p:.2f} / {s:.3f}" for p, _, s in sets)])
@@ -215,7 +223,7 @@ def static(args, command: str) -> None:
 
     result = scored(args, "static", [""], moments("canonical"), moments("random", "target"), still=True)
     head = ["model", "pixels", *(METRICS[k][0] for k in METRICS), "LPIPS"]
-    rows = [[m.label, args.size, *cells(result["", m.label]), ""] for m in methods(args.methods)]
+    rows = [[m.label, args.size, *cells(result["", m.label]), ""] for m in args.methods]
     place = {"psnr": 0, "ssim": 2}
     for (size, model), printed in paper.STATIC.items():
         own = [f"{printed[place[k]]:.{METRICS[k][1]}f}" if k in place else "" for k in METRICS]
@@ -233,7 +241,7 @@ def video(args, command: str) -> None:
 
     result = scored(args, "video", [""], choose, lambda s, _: protocol.novel(s.seq, choose(s), protocol.targets(s.seq)))
     head = ["model", *(METRICS[k][0] for k in METRICS), "LPIPS"]
-    rows = [[m.label, *cells(result["", m.label]), ""] for m in methods(args.methods)]
+    rows = [[m.label, *cells(result["", m.label]), ""] for m in args.methods]
     place = {"psnr": 0, "ssim": 2}
     for model, printed in paper.VIDEO.items():
         own = [f"{printed[place[k]]:.{METRICS[k][1]}f}" if k in place else "" for k in METRICS]
@@ -248,18 +256,18 @@ def frame_rate(args, command: str) -> None:
     """Inputs at every 4th frame, one canonical view each; the frames between are scored against the truth."""
 
     result = scored(args, "frame-rate", [""], lambda s, _: every(s, args.every), novel_views)
-    found, labels = subjects(args.folders, args.size), [m.label for m in methods(args.methods)]
+    labels = [m.label for m in args.methods]
     rows = []
     for label in labels:
         for seen in (True, False):
             parts = []
-            for s, r in zip(found, result["", label], strict=True):
+            for s, r in zip(args.subjects, result["", label], strict=True):
                 first = s.seq.frame_start
                 here = [((s.seq.views[i].frame - first) % args.every == 0) == seen for i in novel_views(s)]
                 parts.append({k: [x for x, h in zip(r[k], here, strict=True) if h] for k in METRICS})
             rows.append([label, "seen" if seen else "between", *cells(parts)])
     head = ["method", "times", *(METRICS[k][0] for k in METRICS)]
-    lengths = sorted({len(s.frames) for s in found})
+    lengths = sorted({len(s.frames) for s in args.subjects})
     what = (
         f"Clips of {', '.join(map(str, lengths))} frames, one canonical view at every {args.every}th frame as input; "
     )
@@ -274,8 +282,8 @@ def lifetimes(args, command: str) -> None:
 
     from timesplat.model.reconstruct import NEEDS_PASSES, reconstruct_views
 
-    for s in subjects(args.folders, args.size):
-        for m in methods(args.methods):
+    for s in args.subjects:
+        for m in args.methods:
             fig, axes = panels(2, width=4.6)
             for n, setup in enumerate(("alternating", "interpolation")):
                 chosen = protocol.inputs(s.seq, setup)
@@ -319,12 +327,12 @@ def pictures(args, command: str) -> None:
     from timesplat.model.pictures import grid
     from timesplat.model.reconstruct import NEEDS_PASSES, reconstruct_views
 
-    for s in subjects(args.folders, args.size):
+    for s in args.subjects:
         chosen, held_out = protocol.inputs(s.seq, args.setup), novel_views(s)
         shown = [held_out[i] for i in np.linspace(0, len(held_out) - 1, args.columns).round().astype(int)]
         truth = s.views(shown)
         rows = {"truth": truth.over(1.0)}
-        for m in tqdm(methods(args.methods), desc=s.name, unit="method", disable=None):
+        for m in tqdm(args.methods, desc=s.name, unit="method", disable=None):
             with torch.inference_mode():
                 inputs = s.views(chosen, m.name in NEEDS_PASSES)
                 g = reconstruct_views(inputs, m.name, checkpoint=m.checkpoint)
