@@ -205,7 +205,9 @@ def evaluate_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--checkpoint", type=Path, help="weights for the one network method named")
     p.add_argument("--out", type=Path, required=True, help="folder for renders, metrics.json, tables.md, tables.csv")
     p.add_argument("--jobs", type=int, default=2, help="processes, one core each (default: 2)")
-    p.add_argument("--seconds", type=float, help="start no reconstruction after this long; the same command goes on")
+    p.add_argument("--seconds", type=float, default=10.0, help="for methods that fit a scene (default: 10)")
+    p.add_argument("--limit", type=float, help="seconds after which no reconstruction is started; then the tables "
+                   "are those of what there is, and the same command goes on")  # fmt: skip
     p.add_argument("--no-lpips", dest="lpips", action="store_false", help="leave LPIPS out even if it has weights")
     p.add_argument("--seed", type=int, default=0)
 
@@ -225,6 +227,8 @@ def evaluate(args: argparse.Namespace) -> int:
     setups = list(dict.fromkeys(check_setup(s.strip()) for s in names.split(",")))
     if len(stride) not in (1, len(sizes)):
         raise InputError(f"--stride {args.stride}: give one number, or one for each of the {len(sizes)} sizes.")
+    if args.seconds <= 0:
+        raise InputError(f"--seconds {args.seconds:g}: give more than 0.")
     if args.jobs < 1:
         raise InputError(f"--jobs {args.jobs}: give 1 or more.")
     several = len(setups) > 1 or len(sizes) > 1 or args.protocol == "paper"
@@ -244,13 +248,14 @@ def evaluate(args: argparse.Namespace) -> int:
         args.out,
         args.checkpoint,
         command=f"timesplat evaluate {' '.join(args.assets)} --setup {args.setup} --size {args.size} "
-        f"--stride {args.stride} --methods {args.methods} --out {args.out}"
+        f"--stride {args.stride} --methods {args.methods} --seconds {args.seconds:g} --out {args.out}"
         + (f" --checkpoint {args.checkpoint}" if args.checkpoint else ""),
         setups=tuple(setups),
         sizes=tuple(sorted(sizes)),
         stride=tuple(n for _, n in sorted(zip(sizes, stride * len(sizes), strict=False))),
         lpips=args.lpips,
-        deadline=time.time() + args.seconds if args.seconds is not None else float("inf"),
+        seconds=args.seconds,
+        deadline=time.time() + args.limit if args.limit is not None else float("inf"),
         jobs=min(args.jobs, len(setups) * len(sequences)) if several or rendered else 1,
     )
     return 2 if failures else 0

@@ -148,20 +148,26 @@ def score(scene: Gaussians4D | Moving, truth: Truth, lpips: LPIPS | None = None)
 
 
 def evaluate_views(
-    views: Views, method: str, truth: Truth, checkpoint: Path | None = None, lpips: LPIPS | None = None
+    views: Views,
+    method: str,
+    truth: Truth,
+    checkpoint: Path | None = None,
+    lpips: LPIPS | None = None,
+    seconds: float = 10.0,
 ) -> tuple[dict, Gaussians4D | Moving]:
     """Reconstructs from views (with depth and flow where the method needs them) and scores -> `summarise` of the
     scores, which are in `frames`; seconds of the reconstruction and of drawing and scoring a view; how many
-    Gaussians there are, and are kept by the filters. And the scene, of those kept."""
+    Gaussians there are, and are kept by the filters. And the scene, of those kept. `seconds` is what methods
+    that fit a scene may take."""
     name = parse_method(method).name
     start = time.perf_counter()
     with torch.no_grad():  # methods that optimise turn gradients on again
-        scene = reconstruct_views(views, name, checkpoint=checkpoint)
+        scene = reconstruct_views(views, name, checkpoint=checkpoint, seconds=seconds)
         kept = scene[scene.alive()]
-    seconds = time.perf_counter() - start
+    taken = time.perf_counter() - start
     frames = score(kept, truth, lpips)
-    each = (time.perf_counter() - start - seconds) / len(truth.picture)
-    row = {"seconds": seconds, "seconds_scoring": each, "gaussians": len(scene), "gaussians_kept": len(kept)}
+    each = (time.perf_counter() - start - taken) / len(truth.picture)
+    row = {"seconds": taken, "seconds_scoring": each, "gaussians": len(scene), "gaussians_kept": len(kept)}
     return summarise(frames) | row | {"frames": frames}, kept
 
 
@@ -177,7 +183,8 @@ def warm_up(seq: Sequence, inputs, methods: list[str], checkpoint: Path | None =
     with torch.no_grad():
         for method in map(parse_method, methods):
             views = load_views(seq, inputs[:2], method.passes)
-            draw(reconstruct_views(views, method.name, checkpoint=checkpoint), views[:1])
+            scene = reconstruct_views(views, method.name, checkpoint=checkpoint, seconds=0.1)
+            draw(scene, views[:1])
 
 
 # ---------------------------------------------------------------- many runs
@@ -194,6 +201,7 @@ class Plan:
     stride: tuple[int, ...] = (1,)  # one for all sizes, or one for each
     checkpoint: Path | None = None
     lpips: bool = True  # where its weights are found
+    seconds: float = 10.0  # what methods that fit a scene may take
     deadline: float = float("inf")  # time.time() from which on no run is started
     jobs: int = 1
 
@@ -209,7 +217,7 @@ def key_of(seq: Sequence, setup: str, size: int | None, stride: int, method: str
     name = parse_method(method).name
     weights = Path(plan.checkpoint or CHECKPOINTS / f"{WEIGHTS.get(name, name)}.safetensors")
     parts = [(seq.root / "transforms.json").read_bytes(), weights.read_bytes() if weights.is_file() else b""]
-    parts.append(f"{setup} {size or seq.width} {stride} {method} {lpips}".encode())
+    parts.append(f"{setup} {size or seq.width} {stride} {method} {lpips} {plan.seconds}".encode())
     return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()[:20]
 
 
@@ -231,7 +239,7 @@ def evaluate_object(
                 truth = load_truth(seq, scored, protocol.novel(seq, chosen, scored), size)
                 views = load_inputs(seq, chosen, passes, size)
             what = replace(views, depth=None, flow=None) if not parse_method(method).passes else views
-            row, _ = evaluate_views(what, method, truth, plan.checkpoint, lpips)
+            row, _ = evaluate_views(what, method, truth, plan.checkpoint, lpips, plan.seconds)
             row |= {"key": key, "object": name, "setup": setup, "size": size or seq.width, "stride": stride}
             row |= {"method": method, "jobs": plan.jobs}
             append(rows, row)
@@ -274,7 +282,7 @@ def evaluate_folders(
             rows += found
             bar.update()
     if not rows:
-        raise InputError(f"{out}: nothing was scored in the time given; allow more seconds.")
+        raise InputError(f"{out}: nothing was scored in the time given; allow more.")
     metrics = gather(rows, command)
     write_metrics(out, metrics)
     print(table(metrics))

@@ -7,6 +7,7 @@ import shutil
 import pytest
 import torch
 
+from timesplat.cli import main
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.model import evaluate
 from timesplat.model.evaluate import draw, evaluate_folders, evaluate_method, load_inputs, load_truth, parse_method
@@ -141,7 +142,7 @@ def test_many_runs_go_on_where_they_were(folders, tmp_path, monkeypatch):
         for size in ("16", "32"):
             a, b = (m["setups"][setup][size]["methods"]["lift"]["psnr"] for m in (first, second))
             assert a == b
-    with pytest.raises(InputError, match="more seconds"):
+    with pytest.raises(InputError, match="allow more"):
         evaluate_folders(sequences, ["hull"], out, deadline=0)
 
 
@@ -151,3 +152,28 @@ def test_processes_give_the_same(folders, tmp_path):
     two = evaluate_folders(sequences, ["lift"], tmp_path / "two", jobs=2)
     assert one["methods"]["lift"]["psnr"] == pytest.approx(two["methods"]["lift"]["psnr"], abs=1e-4)
     assert two["jobs"] == 2 and list(two["objects"]) == ["a", "b"]
+
+
+def test_bad_options_are_refused_before_anything_runs(folders, tmp_path, capsys):
+    words = ["evaluate", str(folders), "--out", str(tmp_path / "out")]
+    for more, says in (
+        (["--setup", "sideways"], "sideways: no such setup"),
+        (["--size", "12x"], "--size 12x: give numbers"),
+        (["--size", "16,32", "--stride", "1,2,3"], "for each of the 2 sizes"),
+        (["--methods", "lift+magic:3"], "magic:3 is not an option"),
+        (["--jobs", "0"], "--jobs 0"),
+        (["--seconds", "0"], "--seconds 0"),
+    ):
+        assert main([*words, *more]) == 2
+        assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_the_command_scores_finished_sequences(folders, tmp_path, capsys):
+    words = ["evaluate", str(folders), "--setup", "alternating", "--size", "16", "--methods", "white", "--jobs", "1"]
+    for f in folders.glob("?/line/transforms.json"):
+        f.write_text(re.sub(r'"rig": "(?!target)\w*"', '"rig": "alternating"', f.read_text()))
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert list(metrics["objects"]) == ["a", "b"] and metrics["methods"]["white"]["psnr"] > 0
+    assert metrics["command"].startswith(f"timesplat evaluate {folders} --setup alternating")
+    assert "LPIPS is left out" in capsys.readouterr().err
