@@ -16,6 +16,7 @@ from timesplat.model.data import Clips
 from timesplat.model.network import PRESETS, Config, Network
 from timesplat.model.optimiser import learning_rate, make_optimisers, take_step
 from timesplat.model.train import Trainer, run
+from timesplat.model.vgg import VGG
 
 
 @pytest.fixture(autouse=True)
@@ -191,3 +192,12 @@ def test_checkpointing_keeps_less_and_changes_nothing(trainer):
     (plain, more), (checkpointed, less) = found
     torch.testing.assert_close(checkpointed, plain, rtol=1e-5, atol=1e-7)
     assert less < more
+
+
+def test_perceptual_loss_joins_where_there_are_weights(trainer, tmp_path, monkeypatch):
+    without = trainer().train_step(np.zeros(4))
+    torch.save(VGG(19).state_dict(), tmp_path / "vgg19.pth")
+    monkeypatch.setenv("TIMESPLAT_WEIGHTS", str(tmp_path))
+    joined = trainer().train_step(np.zeros(4))
+    assert joined[0] > without[0] and joined[1] == without[1]
+    assert trainer("--perceptual", "0").train_step(np.zeros(4)) == without
