@@ -47,6 +47,14 @@ def test_untrained_paper_head_starts_at_the_appendix_biases(views):
     torch.testing.assert_close(distance, torch.full_like(distance, 2.3), atol=1e-5, rtol=0)
 
 
+def test_paper_head_has_the_same_shapes_in_training(views):
+    torch.manual_seed(0)
+    net = Network(Config(**TINY, head="paper"))
+    a, b = net(views), net.eval()(views)
+    torch.testing.assert_close(a.covariance4(), b.covariance4())
+    torch.testing.assert_close(a.scale.square().sum(-1), b.scale.square().sum(-1))  # the trace
+
+
 def test_clamps_hold(views):
     torch.manual_seed(0)
     net = Network(Config(**TINY, head="kinematic"))

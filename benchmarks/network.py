@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How fast the network's forward pass is: `python benchmarks/network.py`; a Markdown table.
+
+Views of a ball (28 % of the patches show it, as with rendered objects), random weights, inference. On the CPU float32
+and the small ones, unless `--all`; on CUDA, where there is one, bfloat16 and all of them.
+
+FLOPs are counted exactly, two for a multiply-add: every linear layer over the tokens that pass through it, and
+the two products of attention, 4·T²·D a block. What is elementwise is not counted. The floor is that count at the
+speed of a large square matrix product, measured on the same machine in the same precision.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+
+import torch
+
+from timesplat.model.network import PRESETS, Network
+from timesplat.model.views import Views
+
+CASES = [("tiny", 24, 64), ("tiny", 24, 128), ("small", 24, 128), ("base", 12, 128), ("base", 24, 256)]
+CASES += [("large", 12, 256), ("large", 24, 256), ("large", 48, 256)]
+SMALL = 3  # how many of them the CPU does by default
+
+
+def ball(views: int, size: int) -> Views:
+    """The views of a ball from cameras in a circle, distance 2.7, 50 degrees."""
+    poses = []
+    for i in range(views):
+        a = 2 * math.pi * i / views
+        right = torch.tensor([-math.sin(a), math.cos(a), 0.0])
+        forward = torch.tensor([-math.cos(a), -math.sin(a), 0.0])
+        pose = torch.eye(4)
+        pose[:3] = torch.stack([right, torch.linalg.cross(forward, right), forward, -2.7 * forward], 1)
+        poses.append(pose)
+    f = 0.5 * size / math.tan(math.radians(25))
+    axis = (torch.arange(size) + 0.5) / size * 2 - 1
+    alpha = (axis[:, None].hypot(axis) < 0.52).float().expand(views, -1, -1)
+    return Views(
+        rgb=torch.rand(views, size, size, 3),
+        alpha=alpha,
+        c2w=torch.stack(poses),
+        intrinsics=torch.tensor([f, f, size / 2, size / 2]).expand(views, 4),
+        time=torch.linspace(-1, 1, views),
+        frame_step=2 / 23,
+    )
+
+
+def flops(network: Network, tokens: int) -> int:
+    """Of a forward pass with that many image tokens."""
+    c = network.config
+    block = 12 * c.width**2  # qkv, projection, MLP
+    every = tokens + c.free
+    linear = tokens * (network.embed.weight.numel() + network.decode.weight.numel()) + every * c.depth * block
+    linear += c.free * c.width * c.outputs
+    return 2 * linear + 4 * c.depth * every**2 * c.width
+
+
+def best(f, device: str, seconds: float) -> float:
+    """Least seconds of f, of at least three calls, after one to warm up."""
+
+    def timed() -> float:
+        start = time.perf_counter()
+        f()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter() - start
+
+    timed()
+    least, calls, end = math.inf, 0, time.perf_counter() + seconds
+    while calls < 3 or time.perf_counter() < end:
+        least, calls = min(least, timed()), calls + 1
+    return least
+
+
+def peak(device: str) -> float:
+    """FLOP/s of a large matrix product."""
+    n, kind = (8192, torch.bfloat16) if device == "cuda" else (1536, torch.float32)
+    a, b = torch.randn(2, n, n, device=device, dtype=kind)
+    return 2 * n**3 / best(lambda: a @ b, device, 2)
+
+
+def row(name: str, views: Views, drop: bool, device: str, roof: float, seconds: float) -> str:
+    torch.manual_seed(0)
+    network = Network(PRESETS[name]).to(device).eval()
+    views = views.to(device)
+    tokens = int(network.kept_patches(views, drop).sum())
+    x = torch.randn(tokens, network.config.width, device=device)
+
+    def whole():
+        with torch.inference_mode(), torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
+            network(views, drop_empty=drop)
+
+    def blocks():
+        with torch.inference_mode(), torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
+            y = x
+            for block in network.blocks:
+                y = block(y)
+
+    count = flops(network, tokens)
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    total, inside = best(whole, device, seconds), best(blocks, device, seconds)
+    memory = f"{torch.cuda.max_memory_allocated() / 2**30:.1f}" if device == "cuda" else ""
+    cells = [device, name, f"{sum(p.numel() for p in network.parameters()) / 1e6:.1f}", len(views)]
+    cells += [f"{views.size[0]}²", "dropped" if drop else "kept", tokens, f"{count / 1e12:.3f}"]
+    cells += [f"{total:.3f}", f"{inside:.3f}", f"{count / total / 1e12:.2f}", f"{count / roof:.3f}"]
+    cells += [f"{count / roof / total:.0%}", memory]
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--all", action="store_true", help="the large ones on the CPU as well: many minutes, 16 GB")
+    parser.add_argument("--threads", type=int, default=1, help="on the CPU (default: 1)")
+    parser.add_argument("--seconds", type=float, default=2, help="per figure")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+
+    head = ["on", "preset", "M weights", "views", "size", "empty patches", "tokens", "TFLOP"]
+    head += ["s", "s in blocks", "TFLOP/s", "floor s", "share of peak", "GB"]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    print("\n".join(lines))
+    for device in ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]:
+        roof = peak(device)
+        for name, views, size in CASES if args.all or device == "cuda" else CASES[:SMALL]:
+            for drop in (True, False):
+                print(row(name, ball(views, size), drop, device, roof, args.seconds), flush=True)
+        print(f"\n{device}: a large matrix product does {roof / 1e12:.3f} TFLOP/s\n")
+
+
+if __name__ == "__main__":
+    main()
