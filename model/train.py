@@ -13,8 +13,8 @@ import argparse
 import json
 import math
 import os
-import resource
 import signal
+import sys
 import time
 from dataclasses import replace
 
@@ -139,10 +139,9 @@ class Trainer:
         the latter compares) since the start of the run; memory in MB, the highest so far."""
         loss, psnr = np.mean([r for r in recent if math.isfinite(r[0])] or [(math.nan, math.nan)], axis=0)
         samples = len(recent) * self.args.accumulate * distributed.size()
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
         line = {"step": self.step, "seconds": round(self.seconds, 1), "cpu_seconds": round(self.cpu, 1)}
         line |= {"loss": round(float(loss), 5), "psnr": round(float(psnr), 3)}
-        line |= {"samples_per_s": round(samples / max(shares.sum(), 1e-9), 2), "memory": round(memory)}
+        line |= {"samples_per_s": round(samples / max(shares.sum(), 1e-9), 2), "memory": peak_memory()}
         if self.args.device.startswith("cuda"):
             line["cuda_memory"] = round(torch.cuda.max_memory_allocated(self.args.device) / 2**20)
         line |= {"skipped": self.skipped, "bad": self.bad}
@@ -273,3 +272,13 @@ class Trainer:
             raise InputError(f"{self.state}: this run cannot be resumed ({e}); choose another --out.") from None
         for k, v in state["progress"].items():
             setattr(self, k, v)
+
+
+def peak_memory() -> int:
+    """MB that this process has held at most; 0 where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
