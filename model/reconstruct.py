@@ -27,6 +27,7 @@ METHODS = {
     "gs-lrm-frame": "after GS-LRM: our network trained without time, each frame from its own views alone",
     "gs-lrm-all": "after GS-LRM: our network trained without time, all views taken for one moment",
     "4dgs": "after 4DGS: 4D Gaussians fitted to the views from random points, for some seconds",
+    "som": "after Shape of Motion: one cloud and a few rigid motions fitted to the views, from swept depths, no tracks",
 }
 NEEDS_PASSES = {"lift", "guided"}
 # The checkpoint of a method that does not have one of its own name.
@@ -85,11 +86,12 @@ def reconstruct_views(
         from .lift import lift
 
         return lift(views)
-    if method == "4dgs":
+    if method in ("4dgs", "som"):
         from .baselines.four_dgs import four_dgs
+        from .baselines.som import som
 
         check_device(device)
-        return four_dgs(views, device, seconds, progress=progress)
+        return {"4dgs": four_dgs, "som": som}[method](views, device, seconds, progress=progress)
     network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
 
     def run(views: Views) -> Gaussians4D:
