@@ -85,10 +85,10 @@ def numbers(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"{text}: whole numbers with commas between, please") from None
 
 
-def scored(args, study: str, conditions: list, choose: Callable, targets: Callable, still: bool = False) -> dict:
+def scored(args, study: str, conditions: list, choose: Callable, targets: Callable, **how) -> dict:
     """Every method on every object in every condition -> {(condition, label): [scores per object]}.
     choose(subject, condition) and targets(subject, condition) give indices of views, or a list of such lists
-    (moments, each reconstructed alone, whose scores are joined)."""
+    (moments, each reconstructed alone, whose scores are joined) with `still`. how: see `score`."""
     scores = Scores(args.out / "scores.json")
     plan = [(s, c, choose(s, c), targets(s, c)) for s in args.subjects for c in conditions]  # bad input shows at once
     out: dict = {}
@@ -96,8 +96,8 @@ def scored(args, study: str, conditions: list, choose: Callable, targets: Callab
     for s, c, inputs, held_out in plan:
         for m in args.methods:
             bar.set_postfix_str(f"{s.name} {m.label} {c}")
-            parts = zip(inputs, held_out, strict=True) if still else [(inputs, held_out)]
-            rows = [scores.of(study, s, m, i, t, still) for i, t in parts]
+            parts = zip(inputs, held_out, strict=True) if how.get("still") else [(inputs, held_out)]
+            rows = [scores.of(study, s, m, i, t, **how) for i, t in parts]
             out.setdefault((c, m.label), []).append({k: [x for r in rows for x in r[k]] for k in METRICS})
             bar.update()
     bar.close()
@@ -140,7 +140,7 @@ def about(args, what: str) -> str:
     )
 
 
-PAPERS = "Rows and columns marked as the paper's are what it prints: its data, its training, 256²."
+PAPERS = "Rows and columns marked as the paper's are what it prints: its data, its training, 256² unless said."
 
 
 # ---------------------------------------------------------------- studies
@@ -150,10 +150,11 @@ def training(args, command: str) -> None:
     """Scaling of training: PSNR of the training samples against steps and CPU-seconds, of several runs."""
     runs = {}
     for word in args.runs:
-        name, _, folder = word.rpartition("=")
-        if not name:
-            raise InputError(f"{word}: name each run, as in letter={folder}.")
-        runs[name] = [line for f in folder.split("+") for line in [read_log(Path(f))]]
+        name, _, folders = word.rpartition("=")
+        if name:
+            runs[name] = [read_log(Path(f)) for f in folders.split("+")]
+        else:
+            runs |= comparisons(Path(word))
     fig, axes = panels(2, width=4.8, height=3.6)
     seconds = "CPU-seconds"
     for n, (name, logs) in enumerate(runs.items()):
@@ -172,6 +173,15 @@ def training(args, command: str) -> None:
     axes[1].set(xlabel=seconds, ylabel="PSNR of training targets (dB)")
     axes[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     save(fig, args.out / "training", command)
+
+
+def comparisons(folder: Path) -> dict[str, list]:
+    """{run: logs of its stages} below a folder that `benchmarks.compare` filled."""
+    logs = sorted(folder.glob("*/log.jsonl"))
+    if not logs:
+        raise InputError(f"{folder}: there is no run in it; give NAME=RUN for a single one.")
+    stages = [[x for x in (p.parent / "first", p.parent) if (x / "log.jsonl").is_file()] for p in logs]
+    return {p.parent.name: [read_log(f) for f in s] for p, s in zip(logs, stages, strict=True)}
 
 
 def views(args, command: str) -> None:
@@ -255,7 +265,7 @@ def video(args, command: str) -> None:
 def frame_rate(args, command: str) -> None:
     """Inputs at every 4th frame, one canonical view each; the frames between are scored against the truth."""
 
-    result = scored(args, "frame-rate", [""], lambda s, _: every(s, args.every), novel_views)
+    result = scored(args, "frame-rate", [""], lambda s, _: every(s, args.every), novel_views, step=args.every)
     labels = [m.label for m in args.methods]
     rows = []
     for label in labels:
@@ -344,7 +354,11 @@ def pictures(args, command: str) -> None:
 METHODS = "sweep,predicted"
 COUNTS = {"type": numbers, "default": [4, 8, 12, 16, 24, 48, 96], "help": "input views (default: 4,8,…,48,96)"}
 EVERY = {"type": int, "default": 4, "metavar": "N", "help": "every N-th frame (default: 4)"}
-RUN = {"nargs": "+", "metavar": "NAME=RUN", "help": "run folders of `timesplat train`; NAME=A+B for stages"}
+RUN = {
+    "nargs": "+",
+    "metavar": "NAME=RUN",
+    "help": "run folders of `timesplat train`, NAME=A+B for stages; or a folder that benchmarks.compare filled",
+}
 WINDOW = {"type": int, "default": 5, "help": "reports that the curves are averaged over (default: 5)"}
 SETUP = {"default": "alternating", "help": f"input views: {protocol.FORMS} (default: alternating)"}
 COLUMNS = {"type": int, "default": 6, "help": "frames to show (default: 6)"}

@@ -135,10 +135,17 @@ def collapse(views: Views) -> Views:
     return replace(views, time=torch.zeros_like(views.time), flow=flow, frame_step=2.0)
 
 
-def score(subject: Subject, method: Method, inputs: list[int], targets: list[int], still: bool = False) -> dict:
+def thin(views: Views, step: int) -> Views:
+    """Views of every `step`-th frame as those of a clip of `step` times fewer frames: motion vectors lead on at
+    the same speed to what is the next frame then."""
+    flow = None if views.flow is None else views.flow * step
+    return replace(views, flow=flow, frame_step=views.frame_step * step)
+
+
+def score(subject: Subject, method: Method, inputs, targets, still: bool = False, step: int = 1) -> dict:
     """Reconstructs from some views and scores others -> {metric: [a figure per target]}, and the number of
-    Gaussians. `still`: with all times collapsed to 0."""
-    views, truth = subject.views(inputs, method.name in NEEDS_PASSES), subject.views(targets)
+    Gaussians. `still`: with all times collapsed to 0; `step`: the inputs are of every step-th frame."""
+    views, truth = thin(subject.views(inputs, method.name in NEEDS_PASSES), step), subject.views(targets)
     if still:
         views, truth = collapse(views), collapse(truth)
     with torch.inference_mode():
@@ -167,14 +174,14 @@ class Scores:
             except json.JSONDecodeError as e:
                 raise InputError(f"{path}: it is damaged ({e}); delete it, and the study starts anew.") from None
 
-    def of(self, study: str, subject: Subject, method: Method, inputs, targets, still: bool = False) -> dict:
+    def of(self, study: str, subject: Subject, method: Method, inputs, targets, **how) -> dict:
         """`score`, or what is known of it. The key holds all that has a say in it but the code."""
-        text = json.dumps([study, list(map(int, inputs)), list(map(int, targets)), still])
+        text = json.dumps([study, list(map(int, inputs)), list(map(int, targets)), how])
         stamp = (subject.seq.root / "transforms.json").stat().st_mtime_ns
         views = hashlib.sha256(f"{text} {subject.seq.root.resolve()} {stamp}".encode()).hexdigest()[:12]
         size = subject.seq.width // subject.by
         key = f"{study} {subject.name} {size} {method.stamp} {views}"
         if key not in self.known:
-            self.known[key] = score(subject, method, inputs, targets, still)
+            self.known[key] = score(subject, method, inputs, targets, **how)
             write(self.path, json.dumps(self.known, indent=0).encode())
         return self.known[key]

@@ -65,7 +65,7 @@ def test_scaling_of_inference(run, tmp_path):
 def test_an_interrupted_study_goes_on(run, tmp_path, monkeypatch, capsys):
     assert run("video", "--methods", "white") == 0
 
-    def stop(subject, method, *rest):
+    def stop(subject, method, *rest, **how):
         if method.name == "lift":
             raise KeyboardInterrupt
         pytest.fail("scored again")
@@ -113,6 +113,13 @@ def test_frames_between_the_inputs_are_scored_apart(run, tmp_path):
     assert mean(rows[1][2]) == pytest.approx(seen, abs=0.006)
 
 
+def test_a_thinned_clip_moves_at_the_same_speed(spheres):
+    views = spheres([0, 4, 8], size=16)
+    thin = subjects.thin(views, 4)
+    torch.testing.assert_close(thin.flow / thin.frame_step, views.flow / views.frame_step)
+    assert thin.frame_step == pytest.approx(8 / 23)
+
+
 def test_lifetimes_and_pictures_are_drawn(run, tmp_path):
     pytest.importorskip("matplotlib")
     assert run("lifetimes", "--methods", "lift") == 0
@@ -141,7 +148,7 @@ def test_training_curves_join_the_stages_of_a_run(tmp_path):
         (["video", "{data}", "--size", "20"], "choose --size"),
         (["video", "{data}/nothing"], "no Sequence"),
         (["pictures", "{data}", "--setup", "sideways", "--size", "16"], "no such setup"),
-        (["training", "nameless"], "name each run"),
+        (["training", "nameless"], "no run in it"),
         (["training", "a={data}"], "no such file"),
     ],
 )
