@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ STILL, SUFFICIENT, AGGRESSIVE = 0.01, 0.25, 0.45
 
 @dataclass
 class Sample:
-    """Input views with depth and flow, and the target views; `name` says which clip they are of."""
+    """Input views, with depth and flow where asked for, and target views; `name` says which clip they are of."""
 
     inputs: Views
     targets: Views
@@ -130,12 +130,19 @@ class Clips:
     """Packed clips and random samples of them."""
 
     def __init__(
-        self, folders: list[Path], cache: Path, shrink: int = 1, sampling: str = "setups", mix: str = "uniform"
+        self,
+        folders: list[Path],
+        cache: Path,
+        shrink: int = 1,
+        sampling: str = "setups",
+        mix: str = "uniform",
+        passes: bool = True,
     ):
         """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
-        than what was rendered. sampling: see sampling.py; mix: see `parse_mix`, groups without clips are left out.
-        Raises InputError where there is no Sequence, or none that the mix would draw."""
-        self.shrink, self.sampling = shrink, sampling
+        than what was rendered. sampling: see sampling.py; mix: see `parse_mix`, groups without clips are left out;
+        passes: whether inputs come with depth and flow. Raises InputError where there is no Sequence, or none that
+        the mix would draw."""
+        self.shrink, self.sampling, self.passes = shrink, sampling, passes
         weights = parse_mix(mix)
         found = [p.parent for f in folders for p in sorted(Path(f).rglob("transforms.json"))]
         if not found:
@@ -166,17 +173,23 @@ class Clips:
             clip = Layout(frame, camera, json.loads(meta["cameras"]), meta["asset"])
             step = 2 / max(int(meta["frames"]) - 1, 1)
             chosen = choose(self.sampling, rng, clip, views, targets)
-            inputs, held_out = (shrink(_views(f, i, step), self.shrink) for i in chosen)
+            parts = zip(chosen, (self.passes, False), strict=True)
+            inputs, held_out = (shrink(_views(f, i, step, passes), self.shrink) for i, passes in parts)
         if self.sampling == "static":
-            for part in (inputs, held_out):
-                part.time, part.flow = 0 * part.time, 0 * part.flow
+            inputs.time, held_out.time = 0 * inputs.time, 0 * held_out.time
+            inputs.flow = inputs.flow if inputs.flow is None else 0 * inputs.flow
         return Sample(inputs, held_out, meta["asset"])
 
 
-def _views(f, indices: np.ndarray, step: float) -> Views:
+def _views(f, indices: np.ndarray, step: float, passes: bool) -> Views:
     # get_slice takes no index lists: whole tensors are memory-mapped, and only these rows are touched.
     rows = torch.from_numpy(np.asarray(indices))
     packed = f.get_tensor("rgba")[rows]
+    rgba = packed[..., :4].float() / 255
+    tensors = [f.get_tensor(k)[rows] for k in ("c2w", "intrinsics", "time")]
+    views = Views(rgba[..., :3], rgba[..., 3], *tensors, step)
+    if not passes:
+        return views
     offsets, values = f.get_tensor("offsets"), f.get_tensor("values")
     known = packed[..., 4] > 0
     depth = torch.full(known.shape, torch.inf)
@@ -184,14 +197,12 @@ def _views(f, indices: np.ndarray, step: float) -> Views:
     for n, i in enumerate(rows.tolist()):
         v = values[offsets[i] : offsets[i + 1]].float()
         depth[n][known[n]], flow[n][known[n]] = v[:, 0], v[:, 1:]
-    rgba = packed[..., :4].float() / 255
-    tensors = [f.get_tensor(k)[rows] for k in ("c2w", "intrinsics", "time")]
-    return Views(rgba[..., :3], rgba[..., 3], *tensors, step, depth, flow)
+    return replace(views, depth=depth, flow=flow)
 
 
 def shrink(views: Views, by: int) -> Views:
-    """The views at 1/by of their size: colours and alpha are averaged as light is, depth and motion over the
-    surface nearest to the camera in each block."""
+    """The views at 1/by of their size: colours and alpha are averaged as light is, depth and motion, if known, over
+    the surface nearest to the camera in each block."""
     if by == 1:
         return views
     height, width = (n // by for n in views.size)
@@ -203,11 +214,13 @@ def shrink(views: Views, by: int) -> Views:
     alpha = blocks(views.alpha[..., None])
     total = alpha.mean(3)
     rgb = (blocks(views.rgb) * alpha).mean(3) / total.clamp_min(1e-6)
+    small = Views(rgb, total[..., 0], views.c2w, views.intrinsics / by, views.time, views.frame_step)
+    if views.depth is None or views.flow is None:
+        return small
     depth, flow = blocks(views.depth[..., None]), blocks(views.flow)
     near = depth <= depth.amin(3, keepdim=True) + 0.05
     near &= torch.isfinite(depth)
     count = near.sum(3)
     mean = (torch.where(near, depth, 0.0).sum(3) / count.clamp_min(1))[..., 0]
     flow = torch.where(near, flow, 0.0).sum(3) / count.clamp_min(1) / by
-    depth = torch.where(count[..., 0] > 0, mean, torch.inf)
-    return Views(rgb, total[..., 0], views.c2w, views.intrinsics / by, views.time, views.frame_step, depth, flow)
+    return replace(small, depth=torch.where(count[..., 0] > 0, mean, torch.inf), flow=flow)

@@ -58,7 +58,8 @@ def load_clips(args: argparse.Namespace) -> Clips:
     """The clips; one process packs, the others then find them packed."""
     if distributed.rank():
         distributed.wait()
-    clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix)
+    passes = args.source == "given" or args.geometric > 0
+    clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix, passes)
     if not distributed.rank():
         distributed.wait()
     return clips

@@ -1,5 +1,7 @@
 """Training data: what comes back is what was rendered, and samples are what they are said to be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -29,6 +31,9 @@ def test_packed_views_are_the_rendered_ones(sphere_folder, tmp_path):
                 k for k in range(len(whole)) if torch.equal(whole.c2w[k], part.c2w[i]) and whole.time[k] == part.time[i]
             )
             assert torch.equal(whole.rgb[n], part.rgb[i]) and torch.equal(whole.alpha[n], part.alpha[i])
+            if part is sample.targets:
+                assert part.depth is None and part.flow is None
+                continue
             on = whole.alpha[n] > 0
             torch.testing.assert_close(part.depth[i][on], whole.depth[n][on], rtol=1e-3, atol=0)
             torch.testing.assert_close(part.flow[i][on], whole.flow[n][on], rtol=1e-3, atol=1e-3)
@@ -87,7 +92,8 @@ def test_static_samples_are_one_frame_at_time_zero(layout, sphere_folder, tmp_pa
     clips = Clips([sphere_folder], tmp_path, sampling="static")
     sample = clips.sample(np.random.default_rng(0), targets=2, views=2)
     for part in (sample.inputs, sample.targets):
-        assert len(part) == 2 and not part.time.any() and not part.flow.any()
+        assert len(part) == 2 and not part.time.any()
+    assert not sample.inputs.flow.any()
 
 
 def test_shrinking_averages_light_and_keeps_the_nearest_surface(spheres):
@@ -101,6 +107,8 @@ def test_shrinking_averages_light_and_keeps_the_nearest_surface(spheres):
     assert (half.depth - exact.depth)[both].abs().median() < 0.02
     assert (half.flow - exact.flow)[both].abs().median() < 0.02
     torch.testing.assert_close(half.intrinsics, exact.intrinsics)
+    blind = shrink(replace(views, depth=None, flow=None), 2)
+    assert blind.depth is None and torch.equal(blind.rgb, half.rgb)
 
 
 def clip(distance: float) -> dict:
