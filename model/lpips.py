@@ -18,8 +18,8 @@ from .vgg import VGG, find_weights
 LAYERS = ["relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3"]
 CHANNELS = (64, 128, 256, 512, 512)
 HINT = (
-    "LPIPS is left out (–): put torchvision's vgg16-397923af.pth, and the lpips package's weights/v0.1/vgg.pth as "
-    "lpips_vgg.pth, into a folder and name it in $TIMESPLAT_WEIGHTS."
+    "LPIPS is left out (–). To have it, put torchvision's vgg16-397923af.pth, and the lpips package's "
+    "weights/v0.1/vgg.pth as lpips_vgg.pth, into a folder and name it in $TIMESPLAT_WEIGHTS."
 )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .lpips import HINT
 from .protocol import TABLE
 from .reconstruct import NEEDS_PASSES
 
@@ -254,8 +255,9 @@ def tables_md(metrics: dict) -> str:
     views = f"{count} objects; four canonical views and a random one, where rendered, at frames ({stride})"
     main, more, cost = ours(metrics)
     timing = f"{metrics['jobs']} runs at a time, one core each" if metrics["jobs"] > 1 else "one run at a time"
+    lacking = all(c["lpips"] is None for by_setup in results(metrics).values() for c in by_setup.values())
     parts = [
-        (made, f"Layout of the paper's tables 1 and 2. Means over {views}.", main),
+        (made, f"Layout of the paper's tables 1 and 2. Means over {views}." + f" {HINT}" * lacking, main),
         (made, "The views among them that no input shows, alone. FLIP: less is better.", more),
         (made, f"Seconds of the reconstruction, from views in memory to Gaussians; {timing}.", cost),
     ]
