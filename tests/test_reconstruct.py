@@ -103,3 +103,16 @@ def test_unknown_method_and_empty_views(sphere_folder, spheres, write_views, tmp
     with pytest.raises(InputError, match="no view shows the object"):
         reconstruct(write_views(views, tmp_path / "empty"), "lift")
     assert set(METHODS) >= {"white", "hull", "lift", "guided", "rgb", "sweep", "predicted"}
+
+
+@pytest.mark.parametrize("method", ["gs-lrm-frame", "gs-lrm-all"])
+def test_without_its_checkpoint_a_baseline_says_so(sphere_folder, tmp_path, monkeypatch, method):
+    monkeypatch.setattr("timesplat.model.reconstruct.CHECKPOINTS", tmp_path)
+    with pytest.raises(InputError, match=r"static\.safetensors: no such checkpoint"):
+        reconstruct(read_sequence(sphere_folder), method)
+
+
+def test_methods_that_fit_take_their_seconds_and_tell(sphere_folder):
+    told = []
+    g = reconstruct(read_sequence(sphere_folder), "4dgs", seconds=0.2, progress=lambda f, text: told.append((f, text)))
+    assert g.alive().all() and told[-1][0] == pytest.approx(1) and told[-1][1].startswith("4dgs, step ")
