@@ -29,7 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 from timesplat.benchmarks import paper
-from timesplat.benchmarks.compare import read_log
+from timesplat.benchmarks.compare import RUNS, read_log
 from timesplat.benchmarks.figures import COLOURS, band, command_line, panels, save, save_picture, smooth, write_table
 from timesplat.benchmarks.subjects import (
     METRICS,
@@ -39,6 +39,7 @@ from timesplat.benchmarks.subjects import (
     at_frame,
     every,
     methods,
+    reconstruct,
     subjects,
 )
 from timesplat.datagen.sequence import InputError
@@ -118,18 +119,25 @@ def novel_views(s: Subject, _=None) -> list[int]:
 
 
 def per_object(rows: list[dict], metric: str) -> np.ndarray:
-    """(objects,) means over views."""
-    return np.array([np.mean(r[metric]) for r in rows])
+    """(objects,) means over the views that have a figure; NaN where none has."""
+    values = [[x for x in r[metric] if x is not None] for r in rows]
+    return np.array([np.mean(v) if v else np.nan for v in values])
 
 
 def cells(rows: list[dict]) -> list[str]:
-    """Mean over objects ± standard error of each metric."""
+    """Mean over objects ± standard error of each metric; – where there is none."""
     out = []
-    for k in METRICS:
+    for k, (_, decimals) in METRICS.items():
         x = per_object(rows, k)
-        error = f" ± {x.std(ddof=1) / len(x) ** 0.5:.{METRICS[k][1]}f}" if len(x) > 1 else ""
-        out.append(f"{x.mean():.{METRICS[k][1]}f}{error}")
+        error = f" ± {x.std(ddof=1) / len(x) ** 0.5:.{decimals}f}" if len(x) > 1 else ""
+        out.append("–" if np.isnan(x).any() else f"{x.mean():.{decimals}f}{error}")
     return out
+
+
+def printed(psnr: float, lpips: float, similarity: float) -> list[str]:
+    """What the paper prints, in the columns of METRICS."""
+    known = {"psnr": psnr, "lpips": lpips, "ssim": similarity}
+    return [f"{known[k]:.{decimals}f}" if k in known else "" for k, (_, decimals) in METRICS.items()]
 
 
 def about(args, what: str) -> str:
@@ -140,6 +148,7 @@ def about(args, what: str) -> str:
     )
 
 
+TITLES = [title for title, _ in METRICS.values()]
 PAPERS = "Rows and columns marked as the paper's are what it prints: its data, its training, 256² unless said."
 
 
@@ -177,7 +186,10 @@ def training(args, command: str) -> None:
 
 def comparisons(folder: Path) -> dict[str, list]:
     """{run: logs of its stages} below a folder that `benchmarks.compare` filled."""
-    logs = sorted(folder.glob("*/log.jsonl"))
+    order = [r.name for r in RUNS]
+    logs = sorted(
+        (p for p in folder.glob("*/log.jsonl") if p.parent.name in order), key=lambda p: order.index(p.parent.name)
+    )
     if not logs:
         raise InputError(f"{folder}: there is no run in it; give NAME=RUN for a single one.")
     stages = [[x for x in (p.parent / "first", p.parent) if (x / "log.jsonl").is_file()] for p in logs]
@@ -188,8 +200,11 @@ def views(args, command: str) -> None:
     """Scaling of inference: random views, spread over the clip; scored on four canonical and a random view a frame."""
     result = scored(args, "views", args.counts, lambda s, n: protocol.inputs(s.seq, f"views-{n}"), paper_views)
     labels = [m.label for m in args.methods]
-    fig, axes = panels(len(METRICS) - 1)
-    for ax, metric in zip(axes, [m for m in METRICS if m != "psnr_fg"], strict=True):
+    complete = [
+        k for k in METRICS if k != "psnr_fg" and not any(np.isnan(per_object(r, k)).any() for r in result.values())
+    ]
+    fig, axes = panels(len(shown))
+    for ax, metric in zip(axes, shown, strict=True):
         for n, label in enumerate(labels):
             curve = np.stack([per_object(result[c, label], metric) for c in args.counts], 1)
             band(ax, args.counts, curve, label, n)
@@ -199,7 +214,7 @@ def views(args, command: str) -> None:
         ax.set(xlabel="random input views", ylabel=METRICS[metric][0])
     axes[0].legend()
     save(fig, args.out / "views", command)
-    head = ["method", "input views", *(METRICS[k][0] for k in METRICS)]
+    head = ["method", "input views", *TITLES]
     rows = [[label, c, *cells(result[c, label])] for label in labels for c in args.counts]
     note = about(args, "Scored: the four canonical views and one random view at every frame.")
     print(write_table(args.out / "views", "Scaling of inference", head, rows, command, [note]))
@@ -213,7 +228,7 @@ def views_per_frame(args, command: str) -> None:
         return protocol.inputs(s.seq, f"random-{c[1]}" if c[0] == "random" else "canonical")
 
     result = scored(args, "views-per-frame", conditions, choose, novel_views)
-    head = ["inputs", "views a frame", "model", *(METRICS[k][0] for k in METRICS)]
+    head = ["inputs", "views a frame", "model", *TITLES]
     head += ["paper: Objaverse4D PSNR / SSIM", "Consistent4D PSNR / SSIM"]
     rows = []
     for c in conditions:
@@ -232,12 +247,9 @@ def static(args, command: str) -> None:
         return lambda s, _: [at_frame(s, f, *rigs) for f in s.frames[:: args.every]]
 
     result = scored(args, "static", [""], moments("canonical"), moments("random", "target"), still=True)
-    head = ["model", "pixels", *(METRICS[k][0] for k in METRICS), "LPIPS"]
-    rows = [[m.label, args.size, *cells(result["", m.label]), ""] for m in args.methods]
-    place = {"psnr": 0, "ssim": 2}
-    for (size, model), printed in paper.STATIC.items():
-        own = [f"{printed[place[k]]:.{METRICS[k][1]}f}" if k in place else "" for k in METRICS]
-        rows.append([f"paper: {model}, GSO", size, *own, f"{printed[1]:.3f}"])
+    head = ["model", "pixels", *TITLES]
+    rows = [[m.label, args.size, *cells(result["", m.label])] for m in args.methods]
+    rows += [[f"paper: {model}, GSO", size, *printed(*x)] for (size, model), x in paper.STATIC.items()]
     what = f"Every {args.every}th frame alone, from its four canonical views; scored: its five random views."
     notes = [about(args, what), PAPERS]
     print(write_table(args.out / "static", "Single moments, times collapsed to 0", head, rows, command, notes))
@@ -250,16 +262,12 @@ def video(args, command: str) -> None:
         return protocol.inputs(s.seq, "video")
 
     result = scored(args, "video", [""], choose, lambda s, _: protocol.novel(s.seq, choose(s), protocol.targets(s.seq)))
-    head = ["model", *(METRICS[k][0] for k in METRICS), "LPIPS"]
-    rows = [[m.label, *cells(result["", m.label]), ""] for m in args.methods]
-    place = {"psnr": 0, "ssim": 2}
-    for model, printed in paper.VIDEO.items():
-        own = [f"{printed[place[k]]:.{METRICS[k][1]}f}" if k in place else "" for k in METRICS]
-        rows.append([f"paper: {model}, Consistent4D", *own, f"{printed[1]:.3f}"])
+    rows = [[m.label, *cells(result["", m.label])] for m in args.methods]
+    rows += [[f"paper: {model}, Consistent4D", *printed(*x)] for model, x in paper.VIDEO.items()]
     what = "Scored: the canonical views that are no input, and one random view, at every frame."
     note = "The first two of the paper's take the sides of frame 1 from a diffusion model, the last one true ones."
     notes = [about(args, what), PAPERS, note]
-    print(write_table(args.out / "video", "Single-view video", head, rows, command, notes))
+    print(write_table(args.out / "video", "Single-view video", ["model", *TITLES], rows, command, notes))
 
 
 def frame_rate(args, command: str) -> None:
@@ -276,7 +284,7 @@ def frame_rate(args, command: str) -> None:
                 here = [((s.seq.views[i].frame - first) % args.every == 0) == seen for i in novel_views(s)]
                 parts.append({k: [x for x, h in zip(r[k], here, strict=True) if h] for k in METRICS})
             rows.append([label, "seen" if seen else "between", *cells(parts)])
-    head = ["method", "times", *(METRICS[k][0] for k in METRICS)]
+    head = ["method", "times", *TITLES]
     lengths = sorted({len(s.frames) for s in args.subjects})
     what = (
         f"Clips of {', '.join(map(str, lengths))} frames, one canonical view at every {args.every}th frame as input; "
@@ -288,19 +296,12 @@ def frame_rate(args, command: str) -> None:
 
 def lifetimes(args, command: str) -> None:
     """Where in time the Gaussians are and how long they live, with all frames seen and with every other one."""
-    import torch
-
-    from timesplat.model.reconstruct import NEEDS_PASSES, reconstruct_views
-
     for s in args.subjects:
         for m in args.methods:
             fig, axes = panels(2, width=4.6)
             for n, setup in enumerate(("alternating", "interpolation")):
                 chosen = protocol.inputs(s.seq, setup)
-                with torch.inference_mode():
-                    inputs = s.views(chosen, m.name in NEEDS_PASSES)
-                    g = reconstruct_views(inputs, m.name, checkpoint=m.checkpoint)
-                    g = g[g.alive()]
+                g = reconstruct(s.views(chosen, m), m)
                 seen = len({s.seq.views[i].frame for i in chosen})
                 label = f"{setup} ({seen} of {len(s.frames)} frames)"
                 draw_lifetimes(axes, g, len(s.frames), label, n)
@@ -331,22 +332,16 @@ def draw_lifetimes(axes, g, frames: int, label: str, n: int) -> None:
 
 def pictures(args, command: str) -> None:
     """Truth and methods side by side from novel views at some frames, inputs of one of the setups."""
-    import torch
-
     from timesplat.model.evaluate import draw
     from timesplat.model.pictures import grid
-    from timesplat.model.reconstruct import NEEDS_PASSES, reconstruct_views
 
     for s in args.subjects:
         chosen, held_out = protocol.inputs(s.seq, args.setup), novel_views(s)
         shown = [held_out[i] for i in np.linspace(0, len(held_out) - 1, args.columns).round().astype(int)]
-        truth = s.views(shown)
-        rows = {"truth": truth.over(1.0)}
+        truth = s.truth(chosen, shown)
+        rows = {"truth": truth.picture}
         for m in tqdm(args.methods, desc=s.name, unit="method", disable=None):
-            with torch.inference_mode():
-                inputs = s.views(chosen, m.name in NEEDS_PASSES)
-                g = reconstruct_views(inputs, m.name, checkpoint=m.checkpoint)
-                rows[m.label] = draw(g[g.alive()], truth)[0]
+            rows[m.label] = draw(reconstruct(s.views(chosen, m), m), truth.views)[0]
         frames = [f"frame {s.seq.views[i].frame}" for i in shown]
         save_picture(grid(rows, frames), args.out / f"pictures-{s.name.replace('/', '-')}-{args.setup}", command)
 

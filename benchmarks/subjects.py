@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -15,15 +15,20 @@ import torch
 from timesplat.benchmarks.figures import replace as write
 from timesplat.datagen.rigs import CANONICAL
 from timesplat.datagen.sequence import InputError, Sequence, read_sequence
-from timesplat.model.data import shrink
-from timesplat.model.evaluate import draw
-from timesplat.model.flip import flip
-from timesplat.model.metrics import psnr, psnr_foreground, ssim
+from timesplat.model import protocol
+from timesplat.model.evaluate import Truth, evaluate_views, load_inputs, load_truth
+from timesplat.model.lpips import LPIPS
 from timesplat.model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
-from timesplat.model.views import Views, load_views
+from timesplat.model.views import Views
 
 # metric -> its column's title, and decimals
-METRICS = {"psnr": ("PSNR (dB)", 2), "psnr_fg": ("PSNR fg (dB)", 2), "ssim": ("SSIM", 3), "flip": ("FLIP", 3)}
+METRICS = {
+    "psnr": ("PSNR (dB)", 2),
+    "psnr_fg": ("PSNR fg (dB)", 2),
+    "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
+    "flip": ("FLIP", 3),
+}
 RENDER = "render it with `timesplat render --rig evaluation --targets 1`"
 
 
@@ -65,15 +70,14 @@ class Subject:
 
     name: str
     seq: Sequence
-    by: int  # the rendered size over the size wanted
+    size: int
 
-    def views(self, indices: Iterable[int], passes: bool = False) -> Views:
-        parts = [shrink(blank_passes(load_views(self.seq, [i], passes)), self.by) for i in indices]
-        pick = {
-            k: torch.cat([getattr(p, k) for p in parts])
-            for k in ("rgb", "alpha", "c2w", "intrinsics", "time", "depth", "flow")
-        }
-        return Views(frame_step=parts[0].frame_step, **pick)
+    def views(self, indices: list[int], method: Method) -> Views:
+        return load_inputs(self.seq, indices, method.name in NEEDS_PASSES, self.size)
+
+    def truth(self, inputs: list[int], targets: list[int]) -> Truth:
+        novel = protocol.novel(self.seq, inputs, targets)
+        return _truth(str(self.seq.root), tuple(targets), tuple(novel), self.size)
 
     @property
     def frames(self) -> list[int]:
@@ -87,11 +91,9 @@ class Subject:
         return found[0]
 
 
-def blank_passes(views: Views) -> Views:
-    """The views with empty depth and motion where they were loaded without: shrinking wants them."""
-    if views.depth is not None:
-        return views
-    return replace(views, depth=torch.full_like(views.alpha, torch.inf), flow=torch.zeros(*views.alpha.shape, 4))
+@lru_cache(maxsize=1)  # methods come one after another on the same truth
+def _truth(root: str, targets: tuple[int, ...], novel: tuple[int, ...], size: int) -> Truth:
+    return load_truth(read_sequence(Path(root)), list(targets), novel, size)
 
 
 def subjects(folders: list[Path], size: int) -> list[Subject]:
@@ -104,9 +106,9 @@ def subjects(folders: list[Path], size: int) -> list[Subject]:
     out = []
     for name, folder in zip(names, found, strict=True):
         seq = read_sequence(folder)
-        if seq.width != seq.height or seq.width % size:
+        if seq.width != seq.height or size < 1 or seq.width % size:
             raise InputError(f"{folder}: {seq.width}x{seq.height} pixels cannot be shrunk to {size}; choose --size.")
-        out.append(Subject(name, seq, seq.width // size))
+        out.append(Subject(name, seq, size))
     return out
 
 
@@ -142,24 +144,21 @@ def thin(views: Views, step: int) -> Views:
     return replace(views, flow=flow, frame_step=views.frame_step * step)
 
 
+def reconstruct(views: Views, method: Method):
+    """The scene, without what the inference filters would never draw."""
+    with torch.no_grad():  # methods that fit a scene turn gradients on again
+        scene = reconstruct_views(views, method.name, checkpoint=method.checkpoint)
+    return scene[scene.alive()]
+
+
 def score(subject: Subject, method: Method, inputs, targets, still: bool = False, step: int = 1) -> dict:
-    """Reconstructs from some views and scores others -> {metric: [a figure per target]}, and the number of
-    Gaussians. `still`: with all times collapsed to 0; `step`: the inputs are of every step-th frame."""
-    views, truth = thin(subject.views(inputs, method.name in NEEDS_PASSES), step), subject.views(targets)
+    """Reconstructs from some views and scores others -> {metric: [a figure per target, None where there is
+    none]}. `still`: with all times collapsed to 0; `step`: the inputs are of every step-th frame."""
+    views, truth = thin(subject.views(inputs, method), step), subject.truth(inputs, targets)
     if still:
-        views, truth = collapse(views), collapse(truth)
-    with torch.inference_mode():
-        g = reconstruct_views(views, method.name, checkpoint=method.checkpoint)
-        g = g[g.alive()]
-        rgb, alpha = draw(g, truth)
-    target = truth.over(1.0)
-    frames = {
-        "psnr": psnr(rgb, target),
-        "psnr_fg": psnr_foreground(rgb, target, alpha, truth.alpha),
-        "ssim": ssim(rgb, target),
-        "flip": flip(rgb, target),
-    }
-    return {k: [round(x, 5) for x in v.tolist()] for k, v in frames.items()} | {"gaussians": len(g)}
+        views, truth = collapse(views), replace(truth, views=collapse(truth.views))
+    row, _ = evaluate_views(views, method.name, truth, method.checkpoint, LPIPS.find())
+    return {k: row["frames"][k] for k in METRICS}
 
 
 class Scores:
@@ -179,8 +178,7 @@ class Scores:
         text = json.dumps([study, list(map(int, inputs)), list(map(int, targets)), how])
         stamp = (subject.seq.root / "transforms.json").stat().st_mtime_ns
         views = hashlib.sha256(f"{text} {subject.seq.root.resolve()} {stamp}".encode()).hexdigest()[:12]
-        size = subject.seq.width // subject.by
-        key = f"{study} {subject.name} {size} {method.stamp} {views}"
+        key = f"{study} {subject.name} {subject.size} {method.stamp} {views}"
         if key not in self.known:
             self.known[key] = score(subject, method, inputs, targets, **how)
             write(self.path, json.dumps(self.known, indent=0).encode())

@@ -97,7 +97,7 @@ def test_single_moments_are_reconstructed_still(run, tmp_path, evaluation_folder
     assert mean(rows["lift"][2]) > mean(rows["white"][2]) + 3
     assert rows["paper: 4D-LRM, GSO"][2] == "27.35"
     subject = subjects.subjects([evaluation_folder], 32)[0]
-    views = subjects.collapse(subject.views(subjects.at_frame(subject, 12, "canonical"), passes=True))
+    views = subjects.collapse(subject.views(subjects.at_frame(subject, 12, "canonical"), subjects.methods("lift")[0]))
     from timesplat.model.lift import lift
 
     g = lift(views)
