@@ -200,9 +200,8 @@ def views(args, command: str) -> None:
     """Scaling of inference: random views, spread over the clip; scored on four canonical and a random view a frame."""
     result = scored(args, "views", args.counts, lambda s, n: protocol.inputs(s.seq, f"views-{n}"), paper_views)
     labels = [m.label for m in args.methods]
-    complete = [
-        k for k in METRICS if k != "psnr_fg" and not any(np.isnan(per_object(r, k)).any() for r in result.values())
-    ]
+    known = [k for k in METRICS if not any(np.isnan(per_object(rows, k)).any() for rows in result.values())]
+    shown = [k for k in known if k != "psnr_fg"]
     fig, axes = panels(len(shown))
     for ax, metric in zip(axes, shown, strict=True):
         for n, label in enumerate(labels):
