@@ -7,7 +7,7 @@ colour, mask, rigidity and the bases' acceleration. Otherwise than there, where 
 monocular depth and long 2D tracks that start the bases and go on guiding them: here cameras stand all around
 and there are neither, so canonical points come from our sweep's depths in the views nearest to the middle of
 the clip, all bases start at rest, and nothing but the pictures tells what moves. Rotations are quaternions
-instead of 6D frames (three times as fast here), bases are smoothed over neighbouring moments, and there is no
+instead of 6D frames, which are cheaper here, bases are smoothed over neighbouring moments, and there is no
 densification.
 """
 
@@ -29,7 +29,7 @@ from ..sweep import sweep_geometry
 from ..views import Views
 from .hull import white
 
-POINTS = 4000
+POINTS = 2500
 BASES = 10
 WINDOW = 8  # views nearest to the middle of the clip, whose points are the canonical ones
 OPACITY = 0.5  # at the start
