@@ -6,8 +6,8 @@ As there: rigid bases given per moment, blended by every Gaussian's softmax, k-m
 colour, mask, rigidity and the bases' acceleration. Otherwise than there, where one casual video comes with
 monocular depth and long 2D tracks that start the bases and go on guiding them: here cameras stand all around
 and there are neither, so canonical points come from our sweep's depths in the views nearest to the middle of
-the clip, all bases start at rest, and nothing but the pictures tells what moves. Rotations are quaternions
-instead of 6D frames, which are cheaper here, bases are smoothed over neighbouring moments, and there is no
+the clip, all bases start at rest, and nothing but the pictures tells what moves. Rotations are quaternions,
+cheaper here than 6D frames, bases are smoothed over neighbouring moments, and there is no
 densification.
 """
 
