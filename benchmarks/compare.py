@@ -238,20 +238,33 @@ def tabulate(args: argparse.Namespace, command: str) -> str:
             replace(folder / "score.json", json.dumps(score(folder, sets[shrink])).encode())
     if not ready:
         raise InputError(f"{args.out}: no finished run to make a table of.")
-    head = ["run", "what changes", "pixels", "parameters", "steps", "CPU-s", "CPU-s/step", "PSNR", "PSNR fg"]
+    head = [
+        "run",
+        "what changes",
+        "pixels",
+        "parameters",
+        "steps",
+        "CPU-s",
+        "CPU-s/step",
+        "PSNR",
+        "PSNR fg",
+        f"PSNR − {ready[0].name}",
+    ]
     head += ["training PSNR, first report", "last"]
-    rows = [row(r, args) for r in ready]
     white = json.loads((stages(ready[0], args)[-1][0] / "score.json").read_text())
+    rows = [row(r, args, white) for r in ready]
     notes = [
         f"PSNR in dB over white, mean ± standard error over {len(white['psnr'])} held-out objects (24 alternating "
-        "canonical inputs, 24 novel views each); fg: over the pixels that show the object. The empty picture "
+        "canonical inputs, 24 novel views each); fg: over the pixels that show the object; "
+        "the difference is taken object by object. The empty picture "
         f"scores {np.mean(white['white']):.2f} and {np.mean(white['white_fg']):.2f} at {white['pixels']}².",
         "Every run: " + " ".join(f"{k} {v}" for k, v in BASE.items()) + f"; on {' and '.join(DATA)}, one core.",
     ]
     return write_table(args.out / "comparisons", "Training comparisons", head, rows, command, notes)
 
 
-def row(r: Run, args: argparse.Namespace) -> list[str]:
+def row(r: Run, args: argparse.Namespace, base: dict) -> list[str]:
+    """`base`: the scores of the first run, from which the others' differ object by object."""
     scores = json.loads((stages(r, args)[-1][0] / "score.json").read_text())
     logs = [read_log(folder) for folder, _ in stages(r, args)]
     steps = sum(log[-1]["step"] for log in logs)
@@ -262,6 +275,8 @@ def row(r: Run, args: argparse.Namespace) -> list[str]:
 
     cells = [r.name, r.change, f"{scores['pixels']}²", f"{scores['parameters'] / 1e6:.2f} M", str(steps)]
     cells += [f"{cpu:.0f}", f"{cpu / steps:.3f}", mean(scores["psnr"]), mean(scores["psnr_fg"])]
+    alike = scores["white"] == base["white"]  # the same objects at the same size
+    cells.append(mean(np.subtract(scores["psnr"], base["psnr"])) if alike else "–")
     return [*cells, f"{logs[0][0]['psnr']:.2f}", f"{logs[-1][-1]['psnr']:.2f}"]
 
 
