@@ -38,7 +38,7 @@ def test_a_figure_is_svg_and_png_with_its_command(tmp_path):
 
 def test_a_band_is_mean_and_standard_error():
     pytest.importorskip("matplotlib")
-    fig, (ax,) = figures.panels(1)
+    _, (ax,) = figures.panels(1)
     figures.band(ax, [0, 1], np.array([[1.0, 5], [3.0, 5]]), "x", 0)
     assert ax.lines[0].get_ydata().tolist() == [2, 5]
     edge = ax.collections[0].get_paths()[0].vertices
