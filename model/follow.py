@@ -87,6 +87,8 @@ def constraints(views: Views, points: Points) -> tuple[Tensor, Tensor, Tensor]:
 def scene_flow(views: Views, points: Points, A: Tensor, next_b: Tensor, previous_b: Tensor, intervals: int) -> Tensor:
     """-> (intervals, G, G, G, 3) motion from each frame of the clip to its next, on voxels over
     [-EXTENT, EXTENT]³ (indices x, y, z)."""
+    if not (next_b.any() or previous_b.any()):  # no motion anywhere (the sweep knows none): zero solves it
+        return torch.zeros(intervals, GRID, GRID, GRID, 3)
     frame = ((views.time + 1) / views.frame_step).round().long()[points.view]
     cell = ((points.place / EXTENT + 1) * (0.5 * GRID)).long().clamp(0, GRID - 1)
     cell = (cell[:, 0] * GRID + cell[:, 1]) * GRID + cell[:, 2]
