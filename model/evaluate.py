@@ -66,8 +66,8 @@ def parse_method(spec: str) -> Method:
             raise InputError(f"{spec}: {option} is not an option; write {name}+refine:SECONDS or {name}+budget:COUNT.")
         key, number = match[1] or match[3], match[2] or match[4]
         values[key] = float(number) if key == "refine" else int(number)
-    if values:
-        raise InputError(f"{spec}: {next(iter(values))} is not there yet; leave it out.")
+    if "budget" in values:
+        raise InputError(f"{spec}: budget is not there yet; leave it out.")
     return Method(name, **values)
 
 
@@ -159,10 +159,11 @@ def evaluate_views(
     scores, which are in `frames`; seconds of the reconstruction and of drawing and scoring a view; how many
     Gaussians there are, and are kept by the filters. And the scene, of those kept. `seconds` is what methods
     that fit a scene may take."""
-    name = parse_method(method).name
+    wanted = parse_method(method)
     start = time.perf_counter()
     with torch.no_grad():  # methods that optimise turn gradients on again
-        scene = reconstruct_views(views, name, checkpoint=checkpoint, seconds=seconds)
+        refine = wanted.refine or 0.0
+        scene = reconstruct_views(views, wanted.name, checkpoint=checkpoint, seconds=seconds, refine=refine)
         kept = scene[scene.alive()]
     taken = time.perf_counter() - start
     frames = score(kept, truth, lpips)
@@ -183,7 +184,8 @@ def warm_up(seq: Sequence, inputs, methods: list[str], checkpoint: Path | None =
     with torch.no_grad():
         for method in map(parse_method, methods):
             views = load_views(seq, inputs[:2], method.passes)
-            scene = reconstruct_views(views, method.name, checkpoint=checkpoint, seconds=0.1)
+            refine = min(method.refine or 0.0, 0.1)
+            scene = reconstruct_views(views, method.name, checkpoint=checkpoint, seconds=0.1, refine=refine)
             draw(scene, views[:1])
 
 

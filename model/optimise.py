@@ -134,6 +134,7 @@ def optimise(
     *,
     steps: int | None = None,
     batch: int = 2,
+    coarse: int = COARSE,
     edit: Callable[[int, float], None] | None = None,
     background: Tensor | None = None,
     seed: int = 0,
@@ -144,12 +145,12 @@ def optimise(
     the same on every run); returns how many.
 
     A step draws `scene()` from `batch` views (all views in turn, in random order) over `background` (3,) or
-    a random colour, large pictures averaged down at first, and descends on `loss(step)`. `edit(number,
-    fraction)` may change the parameters' rows after a step, while their gradients are still there.
+    a random colour, pictures larger than `coarse` pixels averaged down at first, and descends on `loss(step)`.
+    `edit(number, fraction)` may change the parameters' rows after a step, while their gradients are still there.
     `progress(fraction, text)` is called about ten times a second; without it a bar shows on a terminal after
     two seconds. Call inside of `gradients()`, with views from `own`."""
     generator = torch.Generator().manual_seed(seed)
-    coarse = shrunk(views, -(-max(views.size) // COARSE))
+    small = shrunk(views, -(-max(views.size) // coarse))
     order: list[int] = []
     start, told, done = time.perf_counter(), 0.0, 0
     bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
@@ -166,7 +167,7 @@ def optimise(
             break
         while len(order) < batch:
             order += torch.randperm(len(views), generator=generator).tolist()
-        now = coarse if fraction < COARSE_UNTIL else views
+        now = small if fraction < COARSE_UNTIL else views
         seen, order = now[order[:batch]], order[batch:]
         height, width = now.size
         behind = torch.rand(3, generator=generator).to(views.rgb) if background is None else background

@@ -48,10 +48,12 @@ def reconstruct(
     checkpoint: Path | None = None,
     progress=None,
     seconds: float = 10.0,
+    refine: float = 0.0,
 ) -> Gaussians4D | Moving:
     """Views `indices` of the Sequence (all of them by default) -> the scene, Gaussians filtered out that the
     paper's inference filters would never draw. `progress(fraction, text)` is called between steps; `seconds`
-    is what methods that fit a scene may take.
+    is what methods that fit a scene may take, `refine` the seconds for which the result is then fitted to the
+    views (`refine.py`).
 
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint."""
     report = progress or (lambda fraction, text: None)
@@ -65,7 +67,7 @@ def reconstruct(
     report(0.3, f"reconstructing ({method})")
     with torch.inference_mode():
         fit = progress and (lambda fraction, text: report(0.3 + 0.7 * fraction, text))
-        g = reconstruct_views(views, method, device, checkpoint, seconds, fit)
+        g = reconstruct_views(views, method, device, checkpoint, seconds, fit, refine)
     return g[g.alive()]
 
 
@@ -76,8 +78,17 @@ def reconstruct_views(
     checkpoint: Path | None = None,
     seconds: float = 10.0,
     progress=None,
+    refine: float = 0.0,
 ) -> Gaussians4D | Moving:
-    """The same from tensors; unfiltered. `seconds` and `progress` are for methods that fit a scene."""
+    """The same from tensors; unfiltered. `seconds` is for methods that fit a scene, `progress` for what takes
+    seconds."""
+    if refine:
+        from .refine import check_seconds
+        from .refine import refine as fit
+
+        check_seconds(refine)
+        start = reconstruct_views(views, method, device, checkpoint, seconds)
+        return fit(start, views, refine, device, near=method in NEEDS_PASSES, progress=progress)
     if method in ("white", "hull"):
         from .baselines import hull
 

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Test-time refinement: better on views it never saw, never below the start, and refusals in one sentence."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from timesplat.cli import main
+from timesplat.datagen.sequence import InputError, read_sequence
+from timesplat.model.asset import read_ply
+from timesplat.model.evaluate import evaluate_method, parse_method
+from timesplat.model.gaussians import Gaussians4D
+from timesplat.model.lift import lift
+from timesplat.model.reconstruct import reconstruct_views
+from timesplat.model.refine import LEAST, error, held_out, merge, refine
+
+
+@pytest.fixture(scope="module")
+def scene(spheres):
+    """Input views, one a frame and from four sides, and views from between these."""
+    inputs = spheres(list(range(24)), size=48)
+    others = spheres(list(range(1, 24, 3)), [(45 + 90 * (i % 4), 15) for i in range(8)], size=48)
+    return inputs, others
+
+
+def spoilt(g: Gaussians4D) -> Gaussians4D:
+    """Moved by a few pixels, washed out, and half transparent."""
+    generator = torch.Generator().manual_seed(0)
+    xyz = g.xyz + 0.03 * torch.randn(g.xyz.shape, generator=generator)
+    return replace(g, xyz=xyz, rgb=0.6 * g.rgb + 0.2, opacity=0.5 * g.opacity)
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_other_views_get_better_by_a_number_of_steps(scene, near):
+    inputs, others = scene
+    start = spoilt(lift(inputs))
+    copy = start.map(torch.clone)
+    with torch.inference_mode():
+        told = []
+        g = refine(start, inputs, 0, near=near, steps=30, progress=lambda f, text: told.append(f))
+    assert error(g, others) < (0.85 if near else 0.6) * error(start, others)
+    assert g.alive().any() and all(torch.isfinite(x).all() for x in (g.xyz, g.scale, g.opacity))
+    assert told[-1] == 1 and torch.equal(start.xyz, copy.xyz) and torch.equal(start.opacity, copy.opacity)
+    again = refine(start, inputs, 0, near=near, steps=30)
+    torch.testing.assert_close(again.xyz, g.xyz)
+
+
+def test_what_gets_no_better_stays(scene, monkeypatch):
+    inputs, _ = scene
+    start = lift(inputs)
+    monkeypatch.setattr("timesplat.model.refine.photographs", lambda step: -10 * step.alpha.var() - step.rgb.var())
+    assert refine(start, inputs, 0, steps=8) is start
+    assert refine(start, inputs, 0.0) is start
+    none = replace(start, opacity=0 * start.opacity)
+    assert refine(none, inputs, 1.0) is none and refine(start[:0], inputs, 1.0).xyz.shape == (0, 3)
+
+
+def test_views_that_judge_lie_within_the_clip(scene):
+    inputs, _ = scene
+    assert held_out(inputs).tolist() == [8, 16]
+    assert held_out(inputs[:LEAST]).tolist() == [2, 5]
+    assert len(held_out(inputs[: LEAST - 1])) == LEAST - 1
+    assert isinstance(refine(lift(inputs[:3]), inputs[:3], 0, steps=3), Gaussians4D)
+
+
+def test_merging_keeps_moments(scene):
+    inputs, _ = scene
+    g = lift(inputs)
+    few = merge(g, 500, 6)
+    assert 350 < len(few) < 650 and merge(g, len(g), 6) is g
+    assert error(few, inputs) < 0.02
+    one = merge(g, 1, 1)
+    assert len(one) < 20
+    pair = g[[0, 0]]
+    same = merge(pair, 1, 1)
+    torch.testing.assert_close(same.covariance3(), pair.covariance3()[:1], atol=1e-7, rtol=1e-3)
+    for k in ("xyz", "t", "velocity", "sigma_t", "rgb"):
+        torch.testing.assert_close(getattr(same, k), getattr(pair, k)[:1], atol=1e-5, rtol=1e-4)
+
+
+def test_refusals(scene):
+    inputs, _ = scene
+    for seconds in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="seconds of refinement: give 0 or more"):
+            reconstruct_views(inputs, "hull", refine=seconds)
+    with pytest.raises(InputError, match="of another kind"):
+        refine(object(), inputs, 1.0)
+
+
+def test_from_the_command_line_and_in_the_tables(scene, write_views, tmp_path, capsys):
+    inputs, others = scene
+    folder = tmp_path / "spheres"
+    write_views(inputs, folder, others)
+    args = ["reconstruct", str(folder), "--method", "hull", "--out", str(tmp_path / "a.ply")]
+    assert main([*args, "--refine", "-1"]) == 2
+    assert "give 0 or more" in capsys.readouterr().err
+    assert main([*args, "--refine", "0.5"]) == 0
+    assert len(read_ply(tmp_path / "a.ply")) > 100
+    assert parse_method("hull+refine:0.5").refine == 0.5
+    seq = read_sequence(folder)
+    chosen = [i for i, v in enumerate(seq.views) if v.rig != "target"]
+    targets = [i for i, v in enumerate(seq.views) if v.rig == "target"]
+    row = {m: evaluate_method(seq, m, chosen, targets)[0]["psnr"] for m in ("hull", "hull+refine:1")}
+    assert row["hull+refine:1"] > row["hull"]
