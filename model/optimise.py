@@ -9,7 +9,6 @@ away between steps.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from tqdm import tqdm
 
 from .gaussians import Gaussians4D, Moving
 from .rasterize import render
+from .threads import clock
 from .views import Views, pad_to_multiple
 
 BETAS, EPSILON = (0.9, 0.99), 1e-10  # Adam's; a shorter memory than usual, for hundreds of steps
@@ -152,10 +152,10 @@ def optimise(
     generator = torch.Generator().manual_seed(seed)
     small = shrunk(views, -(-max(views.size) // coarse))
     order: list[int] = []
-    start, told, done = time.perf_counter(), 0.0, 0
+    start, told, done = clock(), 0.0, 0
     bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
     while True:
-        elapsed = time.perf_counter() - start
+        elapsed = clock() - start
         spent, most = (elapsed, seconds) if steps is None else (done, steps)
         fraction = min(spent / most, 1.0) if most > 0 else 1.0
         if elapsed - told > 0.1 or fraction >= 1:

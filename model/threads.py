@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -37,6 +38,13 @@ def each(jobs: Iterable[tuple], work: Callable) -> list:
     for helper in helpers:
         helper.result()
     return results
+
+
+def clock() -> float:
+    """Seconds to measure work by: processor time where one thread does it (then what else the machine does at the
+    same time neither lengthens a measure nor shortens a fit), the clock on the wall where several do, or a GPU."""
+    alone = torch.get_num_threads() == 1 and not torch.cuda.is_initialized()
+    return time.process_time() if alone else time.perf_counter()
 
 
 def parts(count: int, size: int) -> list[tuple[int, int]]:

@@ -13,7 +13,6 @@ densification.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +25,7 @@ from ..gaussians import Gaussians4D
 from ..network import multiply
 from ..optimise import COARSE, Parameters, Step, gradients, optimise, own, photographs, shrunk
 from ..sweep import sweep_geometry
+from ..threads import clock
 from ..views import Views
 from .hull import white
 
@@ -114,7 +114,7 @@ def som(
 ) -> Motion | Gaussians4D:
     """Views (RGB and alpha alone are used) -> Motion on the CPU, after `seconds`, or `steps` where given; where
     no view shows the object, nothing (`white`). For `progress` see `optimise`."""
-    start = time.perf_counter()
+    start = clock()
     with gradients():
         views = own(views)
         generator = torch.Generator().manual_seed(seed)
@@ -154,7 +154,7 @@ def som(
             )
             return out + RIGID * (at - rest).square().mean()
 
-        left = seconds - (time.perf_counter() - start)
+        left = seconds - (clock() - start)
         optimise(
             p,
             lambda: activate(p.values, moments, smooth),
