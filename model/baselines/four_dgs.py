@@ -108,13 +108,14 @@ def activate(raw: dict[str, Tensor]) -> Gaussians4D:
 
 
 @torch.no_grad()
-def densify(p: Parameters, pull: Tensor, generator: torch.Generator) -> None:
+def densify(p: Parameters, pull: Tensor, generator: torch.Generator, most: int = MOST) -> None:
     """Removes the faint and the lost, and splits the SHARE of the rest that was pulled hardest (pull (N,)) in
-    two: smaller, and apart by a random step within the Gaussian, so that both together look about as it did."""
+    two: smaller, and apart by a random step within the Gaussian, so that both together look about as it did;
+    never more than `most` in all."""
     keep = (torch.sigmoid(p["opacity"]) > FAINT) & (p["xyz"].abs().amax(-1) < OUTSIDE)
     kept = keep.nonzero()[:, 0]
     n = len(kept)
-    count = max(min(int(SHARE * n), MOST - n), 0)
+    count = max(min(int(SHARE * n), most - n), 0)
     split = pull[kept].topk(count).indices
     p.rows(torch.cat([kept, kept[split]]))
     both = torch.cat([split, torch.arange(n, n + count, device=split.device)])
