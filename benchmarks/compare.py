@@ -72,7 +72,7 @@ RUNS = [
     Run("zoo", "procedural objects alone", data=("zoo",)),
     Run("low-first", "32² for the first half of the steps", first={"--shrink": 4}),
     Run("base", "Base preset, 32², 4 views: runs and learns", {"--preset": "base", **BRIEF}, steps=40),
-    Run("large", "Large preset, 32², 4 views: runs and learns", {"--preset": "large", **BRIEF}, steps=40),
+    Run("large", "Large preset, 32², 4 views: runs and learns", {"--preset": "large", **BRIEF}, steps=20),
 ]
 
 
