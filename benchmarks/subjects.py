@@ -16,9 +16,9 @@ from timesplat.benchmarks.figures import replace as write
 from timesplat.datagen.rigs import CANONICAL
 from timesplat.datagen.sequence import InputError, Sequence, read_sequence
 from timesplat.model import protocol
-from timesplat.model.evaluate import Truth, evaluate_views, load_inputs, load_truth
+from timesplat.model.evaluate import Truth, evaluate_views, load_inputs, load_truth, parse_method
 from timesplat.model.lpips import LPIPS
-from timesplat.model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
+from timesplat.model.reconstruct import CHECKPOINTS, WEIGHTS, reconstruct_views
 from timesplat.model.views import Views
 
 # metric -> its column's title, and decimals
@@ -43,19 +43,20 @@ class Method:
     @property
     def stamp(self) -> str:
         """Changes with the method and the weights it loads."""
-        path = self.checkpoint or CHECKPOINTS / f"{WEIGHTS.get(self.name, self.name)}.safetensors"
+        base = parse_method(self.name).name
+        path = self.checkpoint or CHECKPOINTS / f"{WEIGHTS.get(base, base)}.safetensors"
         weights = hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.is_file() else "-"
         return f"{self.name} {weights}"
 
 
 def methods(text: str) -> list[Method]:
-    """`lift,predicted,mine=predicted@run/network.safetensors` -> Methods: [LABEL=]METHOD[@CHECKPOINT]."""
+    """`lift,sweep+refine:4,mine=predicted@run/network.safetensors` -> Methods: [LABEL=]METHOD[@CHECKPOINT], METHOD as
+    in `timesplat evaluate`."""
     found = []
     for word in filter(None, (w.strip() for w in text.split(","))):
         label, _, rest = word.rpartition("=")
         name, _, checkpoint = rest.partition("@")
-        if name not in METHODS:
-            raise InputError(f"{name}: no such method; choose from {', '.join(METHODS)}.")
+        parse_method(name)  # refuses what is none
         if checkpoint and not Path(checkpoint).is_file():
             raise InputError(f"{checkpoint}: no such checkpoint; train one with `timesplat train`.")
         found.append(Method(name, label or name, Path(checkpoint) if checkpoint else None))
@@ -73,7 +74,7 @@ class Subject:
     size: int
 
     def views(self, indices: list[int], method: Method) -> Views:
-        return load_inputs(self.seq, indices, method.name in NEEDS_PASSES, self.size)
+        return load_inputs(self.seq, indices, parse_method(method.name).passes, self.size)
 
     def truth(self, inputs: list[int], targets: list[int]) -> Truth:
         novel = protocol.novel(self.seq, inputs, targets)
@@ -147,7 +148,8 @@ def thin(views: Views, step: int) -> Views:
 def reconstruct(views: Views, method: Method):
     """The scene, without what the inference filters would never draw."""
     with torch.no_grad():  # methods that fit a scene turn gradients on again
-        scene = reconstruct_views(views, method.name, checkpoint=method.checkpoint)
+        wanted = parse_method(method.name)
+        scene = reconstruct_views(views, wanted.name, checkpoint=method.checkpoint, refine=wanted.refine or 0.0)
     return scene[scene.alive()]
 
 
