@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..datagen.sequence import InputError
-from .baselines.four_dgs import EVERY, UNTIL, activate, densify
+from .baselines.four_dgs import EVERY, RATES, UNTIL, activate, densify
 from .gaussians import Gaussians4D, Moving, scale_rotation_from_covariance
 from .optimise import Parameters, Step, gradients, optimise, own, photographs
 from .rasterize import render
@@ -32,18 +32,8 @@ LIFE = 0.25  # least σ_t, an eighth of the clip: several views of one a frame
 FADE = 0.3  # of opacity at the start: what hides the rest must not be there before it is known to be right
 COARSE = 64  # longest side in pixels of the pictures at first: 0.1 dB and a fifth more steps
 PRICE = 0.1  # of mean opacity, in the loss, times the share of the pictures that the object covers: 0.2 dB over 0.04
-# Learning rates at the start and at the end, of the raw parameters: those of four_dgs.
-FREE = {
-    "xyz": (4e-3, 4e-4),
-    "t": (2e-3, 2e-4),
-    "velocity": (1e-2, 1e-3),
-    "sigma_t": (1e-2, 1e-3),
-    "scale": (2e-2, 5e-3),
-    "rotation": (1e-2, 2e-3),
-    "rgb": (2e-2, 4e-3),
-    "opacity": (1e-1, 2e-2),
-}
-# A prediction from depth and motion: its places are right to a pixel, and some 80 steps are all there is time for.
+# Learning rates at the start and at the end, of the raw parameters (four_dgs's for a prediction from RGB), where
+# depth and motion are known: places are right to a pixel, and some 80 steps are all there is time for.
 # No price, and low rates: four times the rate of opacity with the price won 0.2 dB more on clouds of 75,000, but lost
 # 0.3 and 1.1 on those of 320,000 and 150,000, which take few steps.
 NEAR = {
@@ -100,7 +90,7 @@ def refine(
         judges = views[judging(views)]
         g = g if near else merge(g, COUNT, MOMENTS)
         best, kept = error(g, judges), None
-        p = Parameters(raw(g) if near else raw(g, LIFE, FADE), NEAR if near else FREE)
+        p = Parameters(raw(g) if near else raw(g, LIFE, FADE), NEAR if near else RATES)
         cover, looked = views.alpha.mean(), 0
         pull, generator = torch.zeros_like(p["t"].detach()), torch.Generator().manual_seed(seed)
 
