@@ -79,13 +79,13 @@ class Gaussians4D:
         cross = (v * s2)[..., None]
         return torch.cat([torch.cat([top, cross], -1), torch.cat([cross.mT, s2[..., None]], -1)], -2)
 
-    def frozen(self, t: float, moment: float = 0.0, life: float = 1e6) -> Gaussians4D:
-        """The scene as it is at time t, unmoving around `moment` for a lifetime σ_t of `life`."""
+    def frozen(self, t: float) -> Gaussians4D:
+        """The scene as it is at time t, for ever."""
         return Gaussians4D(
             xyz=self.position(torch.as_tensor(t, dtype=self.xyz.dtype)),
-            t=torch.full_like(self.t, moment),
+            t=torch.zeros_like(self.t),
             velocity=torch.zeros_like(self.velocity),
-            sigma_t=torch.full_like(self.sigma_t, life),
+            sigma_t=torch.full_like(self.sigma_t, 1e6),
             scale=self.scale,
             rotation=self.rotation,
             rgb=self.rgb,

@@ -32,10 +32,9 @@ LIFE = 0.25  # least σ_t, an eighth of the clip: several views of one a frame
 FADE = 0.3  # of opacity at the start: what hides the rest must not be there before it is known to be right
 COARSE = 64  # longest side in pixels of the pictures at first: 0.1 dB and a fifth more steps
 PRICE = 0.1  # of mean opacity, in the loss, times the share of the pictures that the object covers: 0.2 dB over 0.04
-# Learning rates at the start and at the end, of the raw parameters (four_dgs's for a prediction from RGB), where
-# depth and motion are known: places are right to a pixel, and some 80 steps are all there is time for.
-# No price, and low rates: four times the rate of opacity with the price won 0.2 dB more on clouds of 75,000, but lost
-# 0.3 and 1.1 on those of 320,000 and 150,000, which take few steps.
+# Learning rates at the start and at the end, of the raw parameters, where depth and motion are known: places are
+# right to a pixel, and some 80 steps are all there is time for. (Four times the rate of opacity, with the price, won a
+# little more on clouds of 75,000, and lost on larger ones, which take fewer steps.) From RGB: those of four_dgs.
 NEAR = {
     "xyz": (2e-4, 2e-4),
     "t": (0.0, 0.0),
