@@ -43,11 +43,12 @@ NOT_FOR = {("gs-lrm-frame", "interpolation")}  # frames without a view
 
 @dataclass(frozen=True)
 class Method:
-    """METHOD[+refine:SECONDS][+budget:COUNT]"""
+    """METHOD[+refine:SECONDS][+budget:N|P%|auto][+dense]"""
 
     name: str
     refine: float | None = None  # seconds of test-time optimisation
-    budget: int | None = None  # most Gaussians
+    budget: str | None = None  # most Gaussians, a share of those predicted, or auto
+    dense: bool = False  # a network's tokens everywhere, not only where the object is
 
     @property
     def passes(self) -> bool:
@@ -57,19 +58,16 @@ class Method:
 
 def parse_method(spec: str) -> Method:
     """Raises InputError naming what is unknown, and what there is."""
-    name, *options = spec.strip().split("+")
+    match = re.fullmatch(
+        r"([^+]+)(?:\+refine:(\d+(?:\.\d+)?))?(?:\+budget:(\d+(?:\.\d+)?%|\d+|auto))?(\+dense)?", spec.strip()
+    )
+    if match and match[1] in METHODS:
+        name, refine, budget, dense = match.groups()
+        return Method(name, refine and float(refine), budget, bool(dense))
+    name = spec.strip().split("+")[0]
     if name not in METHODS:
         raise InputError(f"{name}: no such method; choose from {', '.join(METHODS)}.")
-    values: dict[str, float | int] = {}
-    for option in options:
-        match = re.fullmatch(r"(refine):(\d+(?:\.\d+)?)|(budget):(\d+)", option)
-        if not match:
-            raise InputError(f"{spec}: {option} is not an option; write {name}+refine:SECONDS or {name}+budget:COUNT.")
-        key, number = match[1] or match[3], match[2] or match[4]
-        values[key] = float(number) if key == "refine" else int(number)
-    if "budget" in values:
-        raise InputError(f"{spec}: budget is not there yet; leave it out.")
-    return Method(name, **values)
+    raise InputError(f"{spec}: write {name}[+refine:SECONDS][+budget:N|P%|auto][+dense], in this order.")
 
 
 # ---------------------------------------------------------------- one run
@@ -164,7 +162,10 @@ def evaluate_views(
     start = clock()
     with torch.no_grad():  # methods that optimise turn gradients on again
         refine = wanted.refine or 0.0
-        scene = reconstruct_views(views, wanted.name, checkpoint=checkpoint, seconds=seconds, refine=refine)
+        scene = reconstruct_views(
+            views, wanted.name, checkpoint=checkpoint, seconds=seconds, refine=refine, budget=wanted.budget,
+            dense=wanted.dense,
+        )  # fmt: skip
         kept = scene[scene.alive()]
     taken = clock() - start
     frames = score(kept, truth, lpips)
@@ -186,7 +187,9 @@ def warm_up(seq: Sequence, inputs, methods: list[str], checkpoint: Path | None =
         for method in map(parse_method, methods):
             views = load_views(seq, inputs[:2], method.passes)
             refine = min(method.refine or 0.0, 0.1)
-            scene = reconstruct_views(views, method.name, checkpoint=checkpoint, seconds=0.1, refine=refine)
+            scene = reconstruct_views(
+                views, method.name, checkpoint=checkpoint, seconds=0.1, refine=refine, budget=method.budget
+            )
             draw(scene, views[:1])
 
 

@@ -49,6 +49,7 @@ def reconstruct(
     progress=None,
     seconds: float = 10.0,
     refine: float = 0.0,
+    budget: str | None = None,
 ) -> Gaussians4D | Moving:
     """Views `indices` of the Sequence (all of them by default) -> the scene, Gaussians filtered out that the
     paper's inference filters would never draw. `progress(fraction, text)` is called between steps; `seconds`
@@ -67,7 +68,7 @@ def reconstruct(
     report(0.3, f"reconstructing ({method})")
     with torch.inference_mode():
         fit = progress and (lambda fraction, text: report(0.3 + 0.7 * fraction, text))
-        g = reconstruct_views(views, method, device, checkpoint, seconds, fit, refine)
+        g = reconstruct_views(views, method, device, checkpoint, seconds, fit, refine, budget)
     return g[g.alive()]
 
 
@@ -79,15 +80,17 @@ def reconstruct_views(
     seconds: float = 10.0,
     progress=None,
     refine: float = 0.0,
+    budget: str | None = None,
+    dense: bool = False,
 ) -> Gaussians4D | Moving:
     """The same from tensors; unfiltered. `seconds` is for methods that fit a scene, `progress` for what takes
-    seconds."""
+    seconds; `dense`: tokens of a network everywhere, and not only where the object is."""
     if refine:
         from .refine import check_seconds
         from .refine import refine as fit
 
         check_seconds(refine)
-        start = reconstruct_views(views, method, device, checkpoint, seconds)
+        start = reconstruct_views(views, method, device, checkpoint, seconds, dense=dense)
         return fit(start, views, refine, device, near=method in NEEDS_PASSES, progress=progress)
     if method in ("white", "hull"):
         from .baselines import hull
@@ -106,7 +109,7 @@ def reconstruct_views(
     network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
 
     def run(views: Views) -> Gaussians4D:
-        return apply_network(network, views, device)
+        return apply_network(network, views, device, drop_empty=not dense)
 
     if method.startswith("gs-lrm"):
         from .baselines import gs_lrm
@@ -115,11 +118,11 @@ def reconstruct_views(
     return run(views)
 
 
-def apply_network(network, views: Views, device: str = "cpu") -> Gaussians4D:
+def apply_network(network, views: Views, device: str = "cpu", drop_empty: bool = True) -> Gaussians4D:
     """Views of any size -> what the network makes of them and of their Geometry, on the CPU."""
     views = pad_to_multiple(views, network.config.patch)
     geometry = geometry_for(network.config.source, views)
-    return network(views.to(device), geometry and geometry.to(device)).to("cpu")
+    return network(views.to(device), geometry and geometry.to(device), drop_empty).to("cpu")
 
 
 def geometry_for(source: str, views: Views):
