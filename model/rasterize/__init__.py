@@ -8,12 +8,14 @@ transmittance 1e-4), so that a model trained with one renders the same with anot
 
 from __future__ import annotations
 
+import importlib.util
+
 import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians4D, Moving
 
-BACKENDS = ("cpu", "cuda", "reference")
+BACKENDS = ("cpu", "cuda", "triton", "reference")
 NEAR = 0.01  # nearest depth of a centre
 BLUR = 0.3  # px², added to the 2D covariance's diagonal
 MARGIN = 0.3  # the Jacobian's slopes are clamped to the image widened by this share of half its size
@@ -51,7 +53,8 @@ def rasterize(
     fx fy cx cy in pixels, pixel centres at +0.5; time (C) in [-1,1].
     background: one value or (3,). inference: skip, per view, Gaussians whose marginal or weighted opacity is
     below 0.05 (appendix A.2); not for training, where it would cut gradients. backend: "cpu" (float32 inside),
-    "cuda" (gsplat) or "reference" (slow; computes in the inputs' precision); None goes by the device.
+    "cuda" (gsplat), "triton" (CUDA with nothing but torch) or "reference" (slow; computes in the inputs'
+    precision); None goes by the device, and on CUDA by whether gsplat is installed.
 
     -> rgb (C,height,width,3) over the background, alpha (C,height,width), in the dtype of xyz.
     ValueError for a wrong shape, NaN or infinity, naming the tensor."""
@@ -79,11 +82,14 @@ def rasterize(
         raise ValueError("rasterize: background must be one finite number or three")
     background = background.expand(3)
 
-    backend = backend or ("cuda" if xyz.is_cuda else "cpu")
+    if backend is None:
+        backend = ("cuda" if importlib.util.find_spec("gsplat") else "triton") if xyz.is_cuda else "cpu"
     if backend == "cpu":
         from .cpu import rasterize as run
     elif backend == "cuda":
         from .cuda import rasterize as run
+    elif backend == "triton":
+        from .triton_kernels import rasterize as run
     elif backend == "reference":
         from .reference import rasterize as run
     else:
