@@ -303,6 +303,33 @@ def check_methods(text: str) -> list[str]:
     return methods
 
 
+def bench_arguments(p: argparse.ArgumentParser) -> None:
+    p.add_argument("assets", nargs="*", help="animated files, zoo:SEED, Sequences rendered with --rig evaluation "
+                   "--targets 1, or folders of either (default: 8 procedural objects no checkpoint saw)")  # fmt: skip
+    p.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write (default: out/bench)")
+    p.add_argument("--objects", type=int, help="only the first N objects")
+    p.add_argument("--quick", action="store_true", help="2 objects unless --objects says, no fit of more than 3 "
+                   "seconds, no chart of the renderer: some 4 minutes")  # fmt: skip
+    p.add_argument("--methods", help="only these ways, at the centre: comma-separated, written as in bench.csv, for "
+                   "example guided,4dgs:10,rgb+refine:3")  # fmt: skip
+    p.add_argument("--renderer", action="store_true", help="only the chart of the renderer: some 2 minutes")
+    p.add_argument("--size", type=int, default=128, help="pixels to render at; 256 adds that size (default: 128)")
+    p.add_argument("--jobs", type=int, default=2, help="processes, one core each (default: 2)")
+    p.add_argument("--limit", type=float, help="seconds after which nothing is started; the charts are then of what "
+                   "all objects have, and the same command goes on")  # fmt: skip
+    p.add_argument("--draw", type=Path, metavar="CSV", help="only draw again, from a bench.csv")
+
+
+def bench(args: argparse.Namespace) -> int:
+    """Speed against accuracy: every way from posed images to novel views, on held-out objects, in under 30 minutes
+    on two cores. Writes into --out: bench.csv (a row for each object and way), bench.md (means, machine, what is
+    on the Pareto frontiers) and bench-*.png and .svg: quality against seconds and against size, Gaussian budgets,
+    numbers of views and sizes, renderer samples. A run that was stopped goes on where it was."""
+    from .benchmarks.bench import run
+
+    return run(args, render_into)
+
+
 def demo_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "asset", nargs="?", help="an animated file, or zoo:SEED (default: a procedural object no checkpoint saw)"
@@ -342,6 +369,7 @@ COMMANDS = {
     "reconstruct": (reconstruct_arguments, reconstruct, "a Sequence to a 4D Gaussian asset"),
     "export": (export_arguments, export, "an asset to USD or .blend"),
     "evaluate": (evaluate_arguments, evaluate, "score methods on held-out views"),
+    "bench": (bench_arguments, bench, "speed against accuracy, in charts"),
     "train": (train_arguments, train, "train a network on Sequences"),
     "extension": (extension_arguments, extension, "build the Blender extension"),
 }
