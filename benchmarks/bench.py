@@ -10,6 +10,8 @@ from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 
+from tqdm import tqdm
+
 from timesplat.benchmarks import charts, renderer
 from timesplat.datagen.render import Settings, cores
 from timesplat.datagen.sequence import InputError
@@ -44,15 +46,12 @@ def run(args: argparse.Namespace, render_into: Callable) -> int:
     check(args)
     started = time.time()
     args.out.mkdir(parents=True, exist_ok=True)
-    failures = []
-    if not args.renderer:
-        failures = measure(args, render_into, started)
-    if not (args.quick or args.methods):
-        samples(args.out / "renderer.csv", args.jobs)
-    if (args.out / "bench.csv").is_file():
-        print(charts.draw(args.out / "bench.csv"))
-    else:
-        print(args.out / f"{charts.draw_renderer(args.out / 'renderer.csv')}.png")
+    if args.renderer:
+        samples(args.out / "bench-renderer.csv", args.jobs)
+        print(args.out / f"{charts.draw_renderer(args.out / 'bench-renderer.csv')}.png")
+        return 0
+    failures = measure(args, render_into, started)
+    print(charts.draw(args.out / "bench.csv"))
     return 2 if failures else 0
 
 
@@ -74,6 +73,8 @@ def measure(args: argparse.Namespace, render_into: Callable, started: float) -> 
     if not sequences:
         raise InputError(f"{args.assets[0]}: nothing to measure; none of the assets could be rendered.")
     points, notes = bench.plan(sequences, args.quick, methods)
+    if not (args.quick or args.methods):
+        samples(args.out / "bench-renderer.csv", args.jobs)
     deadline = started + args.limit if args.limit is not None else float("inf")
     rows = bench.run(sequences, points, args.out, args.jobs, deadline, started)
     if not rows:
@@ -92,18 +93,19 @@ def measure(args: argparse.Namespace, render_into: Callable, started: float) -> 
 
 
 def samples(path: Path, jobs: int) -> None:
-    """renderer.csv, if there is none yet: as many objects at a time as `jobs`, one core each."""
+    """bench-renderer.csv, if there is none yet: as many objects at a time as `jobs`, one core each."""
     if path.is_file():
         return
-    rows, assets = [], list(renderer.OBJECTS)
-    while assets:
-        batch, assets = assets[:jobs], assets[jobs:]
-        children = []
-        try:
-            children += [renderer.start(a, cores()[i % len(cores())]) for i, a in enumerate(batch)]
-            for child, asset in zip(children, batch, strict=True):
-                rows += renderer.finish(child, asset)
-        finally:
-            for child in children:
-                child.kill()
+    rows: list[dict] = []
+    with tqdm(total=len(renderer.OBJECTS), desc="renderer", unit="object", disable=None) as bar:
+        for first in range(0, len(renderer.OBJECTS), jobs):
+            batch, children = renderer.OBJECTS[first : first + jobs], []
+            try:
+                children += [renderer.start(a, cores()[i % len(cores())]) for i, a in enumerate(batch)]
+                for child, asset in zip(children, batch, strict=True):
+                    rows += renderer.finish(child, asset)
+                    bar.update()
+            finally:
+                for child in children:
+                    child.kill()
     charts.write_renderer(path, rows, "timesplat bench --renderer")

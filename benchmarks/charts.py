@@ -2,21 +2,22 @@
 """The pictures and the page of `timesplat bench`, from its bench.csv alone: `draw(Path("out/bench/bench.csv"))`.
 
 Beside the CSV: bench.md, bench-seconds, bench-size, bench-budgets and bench-inputs as SVG and PNG (those there are
-figures for), and bench-renderer from a renderer.csv. Squares see depth and motion, circles RGB alone; ours are filled,
-baselines hollow. Bars are standard errors over objects of the paired differences to the way at the centre that sees
-the same (`guided`, `rgb`), which has none itself.
+figures for), and bench-renderer from a bench-renderer.csv. Squares see depth and motion, circles RGB alone; ours are
+filled, baselines hollow. Bars are standard errors over objects of the paired differences to the way at the centre that
+sees the same (`guided`, `rgb`), which has none itself.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from itertools import groupby, pairwise
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
 from timesplat.benchmarks.figures import COLOURS, panels, replace, save
+from timesplat.benchmarks.labels import plain, settle
 from timesplat.benchmarks.renderer import COLUMNS as RENDERER
 from timesplat.benchmarks.renderer import TRUTH
 from timesplat.datagen.sequence import InputError
@@ -57,7 +58,7 @@ def draw(path: Path) -> str:
         pictures.append(_save(draw_budgets(losses), path, "budgets", command))
     if len(means) > len(centre):
         pictures.append(_save(draw_inputs(means, setup, size), path, "inputs", command))
-    renderer = path.with_name("renderer.csv")
+    renderer = path.with_name(f"{path.stem}-renderer.csv")
     if renderer.is_file():
         pictures.append(draw_renderer(renderer))
     replace(path.with_suffix(".md"), page(means, centre, rows, command, facts, pictures).encode())
@@ -154,17 +155,6 @@ def on_frontier(means: list[Mean], cost: str, worth: str) -> list[Mean]:
     return [means[i] for i in frontier([m.mean[cost] for m in means], [sign * m.mean[worth] for m in means])]
 
 
-def plain(ax, axis=None) -> None:
-    """Plain numbers on a logarithmic axis (by default x): 0.3, 1, 3, 10k."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis = axis or ax.xaxis
-    low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(10, subs=(1.0,) if high / low > 3000 else (1.0, 3.0), numticks=20))
-    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v / 1000:g}k" if v >= 1000 else f"{v:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
 def key(ax, means: list[Mean]) -> None:
     """What the markers and the grey lines mean, above a panel."""
     from matplotlib.lines import Line2D
@@ -180,57 +170,6 @@ def key(ax, means: list[Mean]) -> None:
     legend = ax.legend(handles=made, fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=5, columnspacing=1)
     legend.set_in_layout(False)
     ax.set_title(" ", fontsize=9)  # room for it
-
-
-def settle(fig, work: list[tuple]) -> None:
-    """Lays the figure out as `save` will, then places the labels of its panels [(ax, …) of `place`]."""
-    fig.tight_layout(rect=(0, 0.05, 1, 1))
-    for job in work:
-        place(*job)
-
-
-def place(ax, labels: list[tuple], hints: list[tuple], drawn: list[tuple], dots: list[tuple]) -> list:
-    """Writes labels (x, y, text, colour) beside their points, where they cover neither each other nor, if it can be
-    helped, the points `dots` [(x, y)] and the lines `drawn` [(xs, ys)]; far ones get a hair line. Hints are small
-    labels that are left out where there is no room. -> the boxes of what is written, in pixels."""
-    figure = ax.figure
-    figure.canvas.draw()
-    pen, dot = figure.canvas.get_renderer(), figure.dpi / 72
-    inside, busy, boxes = ax.get_window_extent(pen), np.zeros((0, 2)), []
-    for xs, ys in drawn:
-        at = ax.transData.transform(np.stack([xs, ys], -1)) if len(xs) else np.zeros((0, 2))
-        steps = (a + (b - a) * np.linspace(0, 1, 48)[:, None] for a, b in pairwise(at))
-        busy = np.concatenate([busy, at, *steps])
-    dots = ax.transData.transform(np.array(dots, float))
-    look = {"textcoords": "offset points", "zorder": 6, "va": "bottom"}
-    for n, (x, y, text, colour) in enumerate([*labels, *hints]):
-        extra = n >= len(labels)
-        words = ax.annotate(text, (x, y), (0, 0), color=colour, fontsize=5.5 if extra else 7, **look)
-        words.set_in_layout(False)
-        box = words.get_window_extent(pen)
-        half, here = np.array([box.width, box.height]) / 2, ax.transData.transform((x, y))
-        best = None
-        for reach in (5, 9) if extra else (5, 9, 14, 20, 28, 38, 50, 64, 80):
-            for angle in np.arange(0, 2 * np.pi, np.pi / 8):
-                middle = here + np.array([np.cos(angle), np.sin(angle)]) * (reach * dot + half)
-                low, high = middle - half, middle + half
-                cost = reach / 40 + sum(20 for a, b in boxes if (low < b + 1).all() and (a < high + 1).all())
-                cost += 4 * ((dots > low - 3 * dot) & (dots < high + 3 * dot)).all(1).sum()
-                cost += 0.12 * ((busy > low) & (busy < high)).all(1).sum()
-                cost += 50 * ((low < inside.p0).any() or (high > inside.p1).any())
-                if best is None or cost < best[0]:
-                    best = cost, middle, low, high, reach
-        cost, middle, low, high, reach = best
-        if extra and cost > 3:
-            words.remove()
-            continue
-        boxes.append((low, high))
-        words.set_position((middle - here - half) / dot)
-        if reach > 14:
-            arrow = {"arrowstyle": "-", "color": colour, "linewidth": 0.4, "shrinkB": 3}
-            line = ax.annotate("", (x, y), (middle - here) / dot, textcoords="offset points", arrowprops=arrow)
-            line.set_in_layout(False)
-    return boxes
 
 
 # ---------------------------------------------------------------- budgets, inputs, the renderer
@@ -311,7 +250,7 @@ def draw_inputs(means: list[Mean], setup: str, size: int):
 
 
 def write_renderer(path: Path, rows: list[dict], command: str) -> None:
-    """renderer.csv, after a comment with the command."""
+    """bench-renderer.csv, after a comment with the command."""
     text = io.StringIO()
     text.write(f"# {command}\n")
     writer = csv.writer(text, lineterminator="\n")
@@ -321,14 +260,16 @@ def write_renderer(path: Path, rows: list[dict], command: str) -> None:
 
 
 def draw_renderer(path: Path) -> str:
-    """bench-renderer beside a renderer.csv: Cycles samples against seconds an image and PSNR. -> its stem."""
+    """The picture beside a bench-renderer.csv: Cycles samples against seconds an image and PSNR. -> its stem."""
     try:
         head, *rest = path.read_text().splitlines()
         rows = [(r["object"], int(r["samples"]), float(r["seconds"]), float(r["psnr"])) for r in csv.DictReader(rest)]
         if not rows:
             raise ValueError
     except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: not a whole renderer.csv; remove it and run `timesplat bench` again.") from None
+        raise InputError(
+            f"{path}: not a whole bench-renderer.csv; remove it and run `timesplat bench` again."
+        ) from None
     fig, (ax,) = panels(1, 5.6, 4.2)
     labels, hints, drawn = [], [], []
     for i, (name, group) in enumerate(groupby(rows, key=lambda r: r[0])):
@@ -342,8 +283,8 @@ def draw_renderer(path: Path) -> str:
     ax.margins(0.14, 0.1)
     plain(ax)
     settle(fig, [(ax, labels, hints, drawn, [(a, b) for xs, ys in drawn for a, b in zip(xs, ys, strict=True)])])
-    save(fig, path.with_name("bench-renderer"), head.removeprefix("# "))
-    return "bench-renderer"
+    save(fig, path.with_suffix(""), head.removeprefix("# "))
+    return path.stem
 
 
 # ---------------------------------------------------------------- the page
