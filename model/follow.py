@@ -2,9 +2,9 @@
 """Following surface points through time: scene flow from motion vectors, and tracks along it.
 
 A motion vector constrains two of the three components of a point's motion. All that the views say about one
-frame interval is gathered in a voxel grid as small least-squares problems; views from different sides
-complete each other, coarser levels fill in where nothing was seen (the far side of a leg moves like its near
-side). Along this field each pixel's point is followed both ways until a view sees the same surface well
+frame interval is gathered in a voxel grid as small least-squares problems for a rigid motion each; views from
+different sides complete each other, coarser levels fill in where nothing was seen (the far side of a leg moves
+like its near side). Along this field each pixel's point is followed both ways until a view sees the same surface well
 enough (its own pixel takes over), sees through the point (it is wrong by then), or the clip ends. A track is
 cut into pieces that are straight to within a fraction of a pixel: each becomes one Gaussian.
 """
@@ -21,10 +21,11 @@ from torch import Tensor
 from .threads import each, parts
 from .views import Views
 
-GRID = 32  # voxels along [-EXTENT, EXTENT]
+GRID = 24  # voxels along [-EXTENT, EXTENT]
 EXTENT = 1.15
-BEYOND = (0.4, 0.1)  # weight of what is known one and two intervals away
-COARSE, COARSEST = 1e-2, 1e-5  # weights of the levels that fill in
+BEYOND = (0.02, 5e-3, 1e-3)  # weight of what is known one to three intervals away: motion changes between frames
+COARSE, COARSEST = 5e-2, 1e-5  # weights of the levels that fill in
+SLIDE, SPIN = 1e-3, 1e-3  # pull of a voxel's motion and turn towards none, as multiples of what is known
 TOLERANCE = 1.3  # depth agreement, in pixel sizes, plus …
 DRIFT = 0.5  # … this per frame of following
 LONGEST = 8.0  # frames that a point is followed
@@ -85,101 +86,128 @@ def constraints(views: Views, points: Points) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scene_flow(views: Views, points: Points, A: Tensor, next_b: Tensor, previous_b: Tensor, intervals: int) -> Tensor:
-    """-> (intervals, G, G, G, 3) motion from each frame of the clip to its next, on voxels over
-    [-EXTENT, EXTENT]³ (indices x, y, z)."""
+    """-> (intervals, G, G, G, 6) motion from each frame of the clip to its next, on voxels over
+    [-EXTENT, EXTENT]³ (indices x, y, z): v and ω, by which a point p of the voxel moves by v + ω x p."""
+    field = np.zeros((intervals, GRID, GRID, GRID, 6), np.float32)
     if not (next_b.any() or previous_b.any()):  # no motion anywhere (the sweep knows none): zero solves it
-        return torch.zeros(intervals, GRID, GRID, GRID, 3)
-    frame = ((views.time + 1) / views.frame_step).round().long()[points.view]
+        return torch.from_numpy(field)
+    frame = ((views.time + 1) / views.frame_step).round().long()[points.view].numpy()
+    B = torch.cat([A, torch.linalg.cross(points.place[:, None].expand_as(A), A)], -1)  # motion = v + ω x place
     cell = ((points.place / EXTENT + 1) * (0.5 * GRID)).long().clamp(0, GRID - 1)
     cell = (cell[:, 0] * GRID + cell[:, 1]) * GRID + cell[:, 2]
-    i, j = torch.triu_indices(3, 3)
-    normal_matrix = (A.mT @ A)[:, i, j]
-    sums = torch.zeros(intervals * GRID**3, 9)
-    for interval, b in ((frame, next_b), (frame - 1, -previous_b)):
-        inside = (interval >= 0) & (interval < intervals)
-        row = torch.cat([normal_matrix, (A * b[..., None]).sum(1)], -1)
-        sums.index_add_(0, (interval * GRID**3 + cell)[inside], row[inside])
-    sums = sums.reshape(intervals, GRID, GRID, GRID, 9).numpy()
-    beyond, out = np.array([1, *BEYOND], np.float32), np.zeros((*sums.shape[:4], 3), np.float32)
-    each([(t,) for t in range(intervals)], lambda t: _field(t, sums, beyond, COARSE, COARSEST, out))
-    return torch.from_numpy(out)
+    known = [x.contiguous().numpy() for x in (cell, B, next_b, previous_b)]
+    weights = np.array([COARSE, COARSEST, SLIDE, SPIN], np.float32)
+    beyond = np.array([1, *BEYOND], np.float32)
+    each([(t,) for t in range(intervals)], lambda t: _field(t, frame, *known, beyond, weights, field))
+    return torch.from_numpy(field)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _field(t, sums, beyond, coarse_weight, coarsest_weight, out):
-    """sums (T,G,G,G,9): upper triangles and right-hand sides of normal equations per interval and voxel, to be
-    joined with those of neighbours in time and space; writes the solutions of interval t to out (T,G,G,G,3)."""
-    intervals, G = sums.shape[0], sums.shape[1]
+def _field(t, frame, cell, B, next_b, previous_b, beyond, weights, out):
+    """Writes the motion of interval t to out (T,G,G,G,6): least squares of B·(v,ω) = b over the points of each
+    voxel, joined with those of neighbours in time and space. frame and cell (n), B (n,2,6), b (n,2)."""
+    G = out.shape[1]
     Q = G // 4
-    near = np.zeros((G, G, G, 9), np.float32)
-    for away in range(-len(beyond) + 1, len(beyond)):
-        if 0 <= t + away < intervals:
-            weight, other = beyond[abs(away)], sums[t + away]
-            for x in range(G):
-                for y in range(G):
-                    for z in range(G):
-                        for c in range(9):
-                            near[x, y, z, c] += weight * other[x, y, z, c]
-    coarse = np.zeros((Q, Q, Q, 9), np.float32)
-    whole = np.zeros(9, np.float32)
+    coarse_weight, coarsest_weight, slide, spin = weights
+    near = np.zeros((G, G, G, 27), np.float32)  # lower triangles of BᵀB, then Bᵀb
+    flat = near.reshape(-1, 27)
+    for i in range(len(frame)):
+        for before in range(2):
+            away = abs(frame[i] - before - t)
+            if away >= len(beyond) or not 0 <= frame[i] - before < len(out):
+                continue
+            for r in range(2):
+                b = -previous_b[i, r] if before else next_b[i, r]
+                q = 0
+                for j in range(6):
+                    w = beyond[away] * B[i, r, j]
+                    for k in range(j + 1):
+                        flat[cell[i], q] += w * B[i, r, k]
+                        q += 1
+                    flat[cell[i], 21 + j] += w * b
+    coarse = np.zeros((Q, Q, Q, 27), np.float32)
+    whole = np.zeros(27, np.float32)
     for x in range(G):
         for y in range(G):
             for z in range(G):
-                for c in range(9):
+                for c in range(27):
                     coarse[x // 4, y // 4, z // 4, c] += near[x, y, z, c] / 64
+                    whole[c] += near[x, y, z, c] / (G * G * G)
     _blur(coarse)
-    for x in range(Q):
-        for y in range(Q):
-            for z in range(Q):
-                for c in range(9):
-                    whole[c] += coarse[x, y, z, c] / (Q * Q * Q)
     _blur(near)
-    rows = np.empty(9, np.float32)
-    for x in range(G):
-        for y in range(G):
-            for z in range(G):
-                for c in range(9):
-                    rows[c] = near[x, y, z, c] + coarse_weight * coarse[x // 4, y // 4, z // 4, c]
-                    rows[c] += coarsest_weight * whole[c]
-                _solve(rows, out[t, x, y, z])
+    rows, rest = np.empty(27, np.float64), np.empty(6, np.float32)
+    for u in range(Q**3):
+        X, Y, Z = 4 * (u // (Q * Q)), 4 * (u // Q % Q), 4 * (u % Q)
+        for c in range(27):
+            rows[c] = coarse_weight * coarse[X // 4, Y // 4, Z // 4, c] + coarsest_weight * whole[c]
+        _solve(rows, X + 1.5, Y + 1.5, Z + 1.5, slide, spin, rest)
+        for x in range(X, X + 4):
+            for y in range(Y, Y + 4):
+                for z in range(Z, Z + 4):
+                    if near[x, y, z, 0] + near[x, y, z, 2] + near[x, y, z, 5] == 0:  # nothing seen here
+                        out[t, x, y, z] = rest
+                        continue
+                    for c in range(27):
+                        rows[c] = near[x, y, z, c] + coarse_weight * coarse[X // 4, Y // 4, Z // 4, c]
+                        rows[c] += coarsest_weight * whole[c]
+                    _solve(rows, x, y, z, slide, spin, out[t, x, y, z])
 
 
 @numba.njit(cache=True, fastmath=True)
 def _blur(x):
-    """Blurs (n,n,n,9) by the triangle 1 2 3 2 1 along each axis, zero outside; in place."""
-    n = x.shape[0]
+    """Blurs (n,n,n,C) by the triangle 1 2 1 along each axis, zero outside; in place."""
+    n, C = x.shape[0], x.shape[3]
     flat = x.reshape(-1)
-    line = np.zeros((n + 4, 9), np.float32)
+    line = np.zeros((n + 2, C), np.float32)
     for axis in range(3):
         below = n ** (2 - axis)  # voxels that follow while this axis stands still
-        stride = 9 * below
+        stride = C * below
         for number in range(n * n):
-            first = (number // below) * n * stride + (number % below) * 9
+            first = (number // below) * n * stride + (number % below) * C
             for k in range(n):
-                for c in range(9):
-                    line[k + 2, c] = flat[first + k * stride + c]
+                for c in range(C):
+                    line[k + 1, c] = flat[first + k * stride + c]
             for k in range(n):
-                for c in range(9):
-                    near = line[k + 1, c] + line[k + 3, c]
-                    total = line[k, c] + line[k + 4, c] + 2 * near + 3 * line[k + 2, c]
-                    flat[first + k * stride + c] = total / 9
+                for c in range(C):
+                    flat[first + k * stride + c] = (line[k, c] + 2 * line[k + 1, c] + line[k + 2, c]) / 4
 
 
 @numba.njit(cache=True, fastmath=True)
-def _solve(row, out):
-    """Upper triangle and right-hand side (9) of 3x3 normal equations -> out (3), by Cramer's rule. A small
-    multiple of the trace keeps the component that nothing constrains at zero."""
-    trace = row[0] + row[3] + row[5]
+def _solve(rows, x, y, z, slide, spin, out):
+    """Lower triangle and right-hand side (27) of the normal equations of voxel x, y, z -> out (6), by Cholesky's
+    decomposition. Small multiples of the trace keep what nothing constrains at zero: the voxel's middle c moves by
+    v + ω x c, and turns by ω."""
+    trace = rows[0] + rows[2] + rows[5]
     if trace < 1e-12:
+        out[:] = 0
         return
-    s = 1 / trace
-    a, b, c, d, e, f = row[0] * s + 1e-3, row[1] * s, row[2] * s, row[3] * s + 1e-3, row[4] * s, row[5] * s + 1e-3
-    p, q, r = row[6] * s, row[7] * s, row[8] * s
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    inverse = 1 / (a * A + b * B + c * C)
-    out[0] = (A * p + B * q + C * r) * inverse
-    out[1] = (B * p + (a * f - c * c) * q + (b * c - a * e) * r) * inverse
-    out[2] = (C * p + (b * c - a * e) * q + (a * d - b * b) * r) * inverse
+    G = GRID
+    c = np.array([(2 * x + 1) / G - 1, (2 * y + 1) / G - 1, (2 * z + 1) / G - 1]) * EXTENT
+    at_middle = np.zeros((3, 6))
+    for k in range(3):
+        at_middle[k, k] = 1
+        at_middle[k, 3 + (k + 1) % 3] = c[(k + 2) % 3]
+        at_middle[k, 3 + (k + 2) % 3] = -c[(k + 1) % 3]
+    N, b = np.empty((6, 6)), rows[21:]
+    q = 0
+    for i in range(6):
+        for j in range(i + 1):
+            N[i, j] = rows[q] + (spin * trace if i == j and i > 2 else 0)
+            for k in range(3):
+                N[i, j] += slide * trace * at_middle[k, i] * at_middle[k, j]
+            for k in range(j):
+                N[i, j] -= N[i, k] * N[j, k]
+            N[i, j] = np.sqrt(N[i, j]) if i == j else N[i, j] / N[j, j]
+            q += 1
+    for i in range(6):
+        for k in range(i):
+            b[i] -= N[i, k] * b[k]
+        b[i] /= N[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            b[i] -= N[k, i] * b[k]
+        b[i] /= N[i, i]
+        out[i] = b[i]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -208,12 +236,15 @@ def _flow_at(field, interval, p, out):
         g = min(max((p[k] / EXTENT + 1) * 0.5 * grid - 0.5, 0.0), grid - 1.001)
         base[k] = int(g)
         part[k] = g - base[k]
-        out[k] = 0
+    m = np.zeros(6, np.float32)
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
         w = (part[0] if a else 1 - part[0]) * (part[1] if b else 1 - part[1]) * (part[2] if c else 1 - part[2])
-        for k in range(3):
-            out[k] += w * field[interval, base[0] + a, base[1] + b, base[2] + c, k]
+        for k in range(6):
+            m[k] += w * field[interval, base[0] + a, base[1] + b, base[2] + c, k]
+    out[0] = m[0] + m[4] * p[2] - m[5] * p[1]
+    out[1] = m[1] + m[5] * p[0] - m[3] * p[2]
+    out[2] = m[2] + m[3] * p[1] - m[4] * p[0]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
