@@ -17,6 +17,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import re
+import signal
 import tempfile
 import time
 from collections.abc import Iterator
@@ -287,6 +288,8 @@ def _map(units: list, setting: tuple, jobs: int) -> Iterator[dict | None]:
 
 
 def _start(setting: tuple, cores: list[int] | None = None, number=None) -> None:
+    if number:  # a child: the parent tells it when to stop
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     if cores:
         with number.get_lock():
             os.sched_setaffinity(0, {cores[number.value % len(cores)]})
