@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from timesplat.benchmarks.figures import COLOURS, panels, replace, save
+from timesplat.benchmarks.figures import COLOURS, MARKERS, panels, replace, save
 from timesplat.benchmarks.labels import plain, settle
 from timesplat.benchmarks.renderer import COLUMNS as RENDERER
 from timesplat.benchmarks.renderer import TRUTH
@@ -124,7 +124,8 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
         drawn.append(([x, x], [y - error, y + error]))
         ax.errorbar(
             x, y, yerr=error or None, color=colour, ecolor=colour, elinewidth=0.8, capsize=2, linestyle="none",
-            marker="s" if m.way.passes else "o", markersize=5, zorder=4,
+            marker="s" if m.way.passes else "o", zorder=4,
+            markersize=3 if cost == "seconds" and "budget" in m.way.spec else 5,
             markerfacecolor="white" if m.way.baseline else colour,
         )  # fmt: skip
     for passes in (True, False):
@@ -196,15 +197,15 @@ def draw_budgets(losses: dict):
         labels, drawn = [], []
         for i, (name, curve) in enumerate(curves.items()):
             colour, (n, gain, _) = COLOURS[i % len(COLOURS)], zip(*curve, strict=True)
-            ax.plot(n, gain, color=colour, marker="o", markersize=3, linewidth=1.1)
+            ax.plot(n, gain, color=colour, marker=MARKERS[i % 5], markersize=3.5, linewidth=1.1)
             stars = [(a, b) for a, b, star in curve if star]
             ax.plot(*zip(*stars, strict=True), marker="*", markersize=9, color=colour, linestyle="none") if stars else 0
             labels.append((n[0], gain[0], name, colour))
             drawn.append((n, gain))
-        ax.set(xscale="log", xlabel="Gaussians", ylabel=f"PSNR against {whole} without a budget (dB)")
+        ax.set(xscale="log", xlabel="Gaussians (star: budget auto)", ylabel="PSNR against no budget (dB)")
         ax.margins(0.14, 0.1)
         plain(ax)
-        ax.set_title("star: budget auto" if any(a for c in curves.values() for *_, a in c) else "", fontsize=8)
+        ax.set_title(whole, fontsize=9)
         work.append((ax, labels, [], drawn, [(a, b) for xs, ys in drawn for a, b in zip(xs, ys, strict=True)]))
     settle(fig, work)
     return fig
