@@ -46,7 +46,7 @@ def test_under_the_interpreter():
         ("_project", "IFFFFFFFDFIiiiiii", {"BLOCK": 128}),
         ("_blend", "FIIFFFFIiiii", {}),
         ("_unblend", "FIIIFFFFIFiiii", {}),
-        ("_add", "FLF", {"BLOCK": 8}),
+        ("_add", "FLFi", {"BLOCK": 8}),
         ("_chain", "IFFFFFFFFDFFFFFFFii", {"BLOCK": 128}),
     ],
 )

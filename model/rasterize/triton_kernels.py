@@ -7,8 +7,8 @@ front to back (float32), groups of Gaussians against all its pixels. The backwar
 front and recovers each transmittance by division. Every (tile, Gaussian) pair owns one row of a gradient buffer,
 which is then summed in a fixed order: no atomics, the same bits on every run.
 
-Developed with Triton's interpreter (TRITON_INTERPRET=1, set before this module is imported), which runs the kernels
-on CPU tensors, and compiled for a card without one; not yet timed.
+Developed with Triton's interpreter (TRITON_INTERPRET=1, set before triton is imported), which runs the kernels on
+CPU tensors, and with its compiler, which needs no card; not yet run on one, nor timed.
 """
 
 from __future__ import annotations
@@ -252,17 +252,17 @@ def _unblend(
 
 
 @triton.jit
-def _add(sums, ends, S, BLOCK: tl.constexpr):
+def _add(sums, ends, S, rows, BLOCK: tl.constexpr):
     """Row k of S: the sum of the rows of sums that belong to it, those before ends[k] and not before ends[k - 1]."""
-    k = tl.program_id(0)
-    f = tl.arange(0, 16)
-    first, end = tl.load(ends + k - 1, mask=k > 0, other=0), tl.load(ends + k)
-    total = tl.zeros((16,), tl.float32)
-    for i in range(first, end, BLOCK):
-        j = i + tl.arange(0, BLOCK)
-        mask = (j < end)[:, None] & (f < ROW)[None, :]
-        total += tl.sum(tl.load(sums + j[:, None] * ROW + f[None, :], mask=mask, other=0.0), 0)
-    tl.store(S + k * ROW + f, total, mask=f < ROW)
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    first = tl.load(ends + k - 1, mask=(k > 0) & (k < rows), other=0)
+    end = tl.load(ends + k, mask=k < rows, other=0)
+    f = tl.arange(0, 16)[None, :]
+    total = tl.zeros((BLOCK, 16), tl.float32)
+    for i in range(tl.max(end - first, 0)):
+        mask = (first + i < end)[:, None] & (f < ROW)
+        total += tl.load(sums + (first + i)[:, None] * ROW + f, mask=mask, other=0.0)
+    tl.store(S + k[:, None] * ROW + f, total, mask=(k < rows)[:, None] & (f < ROW))
 
 
 @triton.jit
@@ -415,7 +415,7 @@ class _Rasterize(torch.autograd.Function):
             P, rows, places, starts, background, g_image, g_alpha, left, last, sums,
             width, height, -(-width // TILE.value), -(-height // TILE.value),
         )  # fmt: skip
-        _add[(len(ids),)](sums, ends, S, 8, num_warps=1)
+        _add[(triton.cdiv(len(ids), 8),)](sums, ends, S, len(ids), 8, num_warps=1)
         slots = torch.full((views * len(xyz),), -1, dtype=torch.int32, device=xyz.device)
         slots[ids.long()] = torch.arange(len(ids), dtype=torch.int32, device=xyz.device)
         out = [torch.empty_like(x) for x in inputs]
