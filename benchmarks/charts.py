@@ -317,7 +317,8 @@ def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, 
         "or `rgb`), object by object, with the standard error of that difference; these are the bars in the pictures. "
         "Seconds: from views in memory to Gaussians, of one thread. FLIP: less is better. Gaussians: those that the "
         "paper's inference filters keep. No megabytes where a scene is no 4D Gaussians. Drawing: milliseconds a view "
-        "at this size. +dense: tokens of the network everywhere, not only where the object is."
+        "at this size. Coverage: what share of the object the input views show, by the way's own Gaussians "
+        "(`model.coverage`). +dense: tokens of the network everywhere, not only where the object is."
     )
     return "\n\n".join(parts) + "\n"
 
@@ -340,9 +341,10 @@ def frontiers(centre: list[Mean]) -> str:
 
 
 def table(means: list[Mean]) -> str:
-    digits = dict(zip(FIGURES, (2, 2, 2, 3, 3, 0, 2, 2, 1), strict=True))
+    digits = dict(zip(FIGURES, (2, 2, 2, 3, 3, 0, 2, 2, 1, 2), strict=True))
     heads = ["way", "sees", "views", "size", "seconds", "PSNR", "gain", "PSNR fg", "SSIM", "FLIP", "Gaussians"]
-    lines = ["| " + " | ".join([*heads, ".ply MB", ".usdc MB", "drawing ms"]) + " |", "|---" * (len(heads) + 3) + "|"]
+    heads += [".ply MB", ".usdc MB", "drawing ms", "coverage"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
 
     def cell(value: float | None, error: float, n: int, signed: bool = False) -> str:
         if value is None:

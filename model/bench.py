@@ -32,6 +32,7 @@ from tqdm import tqdm
 from ..datagen.sequence import InputError, Sequence, read_sequence
 from . import protocol
 from .asset import write_ply
+from .coverage import coverage
 from .evaluate import Plan, append, draw, evaluate_views, key_of, load_inputs, load_truth, parse_method, read_rows
 from .evaluate import warm_up as warm_up_methods
 from .reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, clip_of
@@ -50,9 +51,11 @@ CENTRE += [f"{name}:{s}" for name in ("4dgs", "som") for s in FITS]
 CENTRE += [f"{name}+refine:{s}" for name in ("guided", "rgb") for s in FITS]
 CENTRE += [f"guided{fit}+budget:{n}" for fit in ("", "+refine:10") for n in BUDGETS]
 AXES = ["lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3"]  # at other sizes and numbers of views
+COVERED = {"lift", "guided", "rgb", "sweep"}  # their Gaussians know which way their surface faces
 QUICK = 3.0  # seconds of fitting that a quick run has at the most
 
 FIGURES = ["seconds", "psnr", "psnr_fg", "ssim", "flip", "gaussians", "ply_mb", "usd_mb", "render_ms"]
+FIGURES += ["coverage"]  # of the object by the views, where it can be told
 COLUMNS = ["object", "way", "setup", "views", "size", *FIGURES]
 
 
@@ -182,7 +185,7 @@ def _truth(root: Path, size: int):
 
 def measure(name: str, seq: Sequence, point: Point) -> dict:
     """One row: COLUMNS of a Point on an object. None where a figure cannot be: a scene that is no 4D Gaussians has
-    no files."""
+    no files, for example."""
     way, views, truth = parse(point.label), _views(seq.root, point.setup, point.size), _truth(seq.root, point.size)
     what = views if way.passes else replace(views, depth=None, flow=None)
     row, scene = evaluate_views(what, way.spec, truth, way.checkpoint, None, way.seconds)
@@ -190,6 +193,7 @@ def measure(name: str, seq: Sequence, point: Point) -> dict:
     draw(scene, truth.views)
     row["render_ms"] = 1000 * (clock() - start) / len(truth.picture)
     row["ply_mb"], row["usd_mb"] = megabytes(scene, seq)
+    row["coverage"] = coverage(scene, what)[0] if way.spec in COVERED else None
     row |= {"gaussians": row["gaussians_kept"], "object": name, "way": way.label, "setup": point.setup}
     row |= {"views": len(views), "size": point.size}
     return {k: row[k] for k in COLUMNS}

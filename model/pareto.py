@@ -23,7 +23,7 @@ def write_csv(path: Path, rows: list[dict], command: str, facts: dict) -> None:
         writer = csv.writer(f, lineterminator="\n")
         writer.writerow(COLUMNS)
         for r in rows:
-            cells = (r[k] for k in COLUMNS)
+            cells = (r.get(k) for k in COLUMNS)
             writer.writerow(["" if c is None else f"{c:.7g}" if isinstance(c, float) else c for c in cells])
     tmp.replace(path)
 
