@@ -206,6 +206,21 @@ def test_slice_is_the_conditional_of_the_4d_gaussian():
         torch.testing.assert_close(render(g, *view)[0], want, rtol=1e-4, atol=2e-5)
 
 
+def test_scale_and_rotation_do_as_their_covariance():
+    """`render` takes them to the compiled code as they are; unit length of a quaternion is not asked for."""
+    (c2w, K, times, width, height), results = cameras(), []
+    for fused in (True, False):
+        g = gaussians().map(lambda x: x.clone().requires_grad_())
+        if not fused:
+            g.cov3 = g.covariance3()
+        rgb, alpha = render(g, c2w, K, times, width, height)
+        rng = torch.Generator().manual_seed(7)
+        ((rgb * torch.randn(rgb.shape, generator=rng)).sum() + alpha.sum()).backward()
+        results.append((rgb.detach(), g.xyz.grad, g.sigma_t.grad, g.scale.grad, g.rotation.grad, g.opacity.grad))
+    for a, b in zip(*results, strict=True):
+        assert (a - b).norm() <= 1e-5 * b.norm() and b.norm() > 0
+
+
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_inference_filters_per_view(backend):
     g, (c2w, K, times, width, height) = gaussians(), cameras()

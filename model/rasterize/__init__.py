@@ -9,6 +9,7 @@ transmittance 1e-4), so that a model trained with one renders the same with anot
 from __future__ import annotations
 
 import importlib.util
+import math
 
 import torch
 from torch import Tensor
@@ -62,25 +63,33 @@ def rasterize(
         "xyz": (xyz, (3,)), "t": (t, ()), "velocity": (velocity, (3,)), "sigma_t": (sigma_t, ()),
         "covariance": (covariance, (3, 3)), "rgb": (rgb, (3,)), "opacity": (opacity, ()),
     }  # fmt: skip
+    return _rasterize(gaussians, c2w, intrinsics, time, width, height, background, inference, backend)
+
+
+def _rasterize(
+    gaussians, c2w, intrinsics, time, width, height, background=1.0, inference=False, backend=None
+) -> tuple[Tensor, Tensor]:
+    """`rasterize` of Gaussians given as name -> (tensor, shape of a row); for the CPU's backend, scale and rotation
+    may stand in for the covariance."""
     cameras = {"c2w": (c2w, (4, 4)), "intrinsics": (intrinsics, (4,)), "time": (time, ())}
     for group in (gaussians, cameras):
         first = next(iter(group.values()))[0]
         rows = first.shape[0] if first.ndim else 0
         for name, (x, shape) in group.items():
-            if tuple(x.shape) != (rows, *shape):
+            if x.shape != (rows, *shape):
                 raise ValueError(f"rasterize: {name} has shape {tuple(x.shape)}, expected {(rows, *shape)}")
             if not x.is_floating_point():
                 raise ValueError(f"rasterize: {name} has dtype {x.dtype}, expected floating point")
-            # One pass; the sum of finite numbers may overflow, so only a suspect is looked at closely.
-            if not x.detach().sum().isfinite() and not x.detach().isfinite().all():
-                bad = int((~x.detach().isfinite()).sum())
-                raise ValueError(f"rasterize: {name} has {bad} values that are NaN or infinite")
     if width < 1 or height < 1:
         raise ValueError(f"rasterize: image size {width} x {height}")
+    xyz = gaussians["xyz"][0]
     background = torch.as_tensor(background, dtype=xyz.dtype, device=xyz.device).detach()
-    if background.numel() not in (1, 3) or background.ndim > 1 or not background.isfinite().all():
+    if (
+        background.numel() not in (1, 3)
+        or background.ndim > 1
+        or not all(map(math.isfinite, background.view(-1).tolist()))
+    ):
         raise ValueError("rasterize: background must be one finite number or three")
-    background = background.expand(3)
 
     if backend is None:
         backend = ("cuda" if importlib.util.find_spec("gsplat") else "triton") if xyz.is_cuda else "cpu"
@@ -94,8 +103,22 @@ def rasterize(
         from .reference import rasterize as run
     else:
         raise ValueError(f"rasterize: backend {backend!r}, expected one of {BACKENDS}")
-    inputs = [x for x, _ in (*gaussians.values(), *cameras.values())]
-    return run(*inputs, (int(width), int(height)), background, bool(inference))
+    inputs = {name: x for name, (x, _) in (gaussians | cameras).items()}
+    if backend != "cpu":
+        _check_finite(inputs)
+    out = run(*inputs.values(), (int(width), int(height)), background.expand(3), bool(inference))
+    if out is None:  # the CPU's backend looks for itself, in a tenth of the time
+        _check_finite(inputs, torch.float32)
+    return out
+
+
+def _check_finite(tensors: dict[str, Tensor], dtype=None) -> None:
+    """ValueError that names the first tensor with a NaN or an infinity (once turned into `dtype`)."""
+    for name, x in tensors.items():
+        x = x.detach().to(dtype or x.dtype)
+        # One pass; the sum of finite numbers may overflow, so only a suspect is looked at closely.
+        if not x.sum().isfinite() and not x.isfinite().all():
+            raise ValueError(f"rasterize: {name} has {int((~x.isfinite()).sum())} values that are NaN or infinite")
 
 
 def render(
@@ -112,7 +135,13 @@ def render(
                 images[i] = (rgb, alpha)
         return tuple(map(torch.stack, zip(*images, strict=True)))
     g = scene
-    return rasterize(
-        g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity,
-        c2w, intrinsics, time, width, height, **kw
-    )  # fmt: skip
+    if g.cov3 is None and not g.xyz.is_cuda and kw.get("backend") in (None, "cpu"):
+        # Compiled too: torch would take as long for the covariances as all the rest takes.
+        shape = {"scale": (g.scale, (3,)), "rotation": (g.rotation, (4,))}
+    else:
+        shape = {"covariance": (g.covariance3(), (3, 3))}
+    gaussians = {
+        "xyz": (g.xyz, (3,)), "t": (g.t, ()), "velocity": (g.velocity, (3,)), "sigma_t": (g.sigma_t, ()),
+        **shape, "rgb": (g.rgb, (3,)), "opacity": (g.opacity, ()),
+    }  # fmt: skip
+    return _rasterize(gaussians, c2w, intrinsics, time, width, height, **kw)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU backend: compiled by numba, parallel over views and tiles, eight pixels at a time.
+"""The CPU backend: compiled by numba, parallel over views and tiles, a block of 8 or 16 pixels at a time.
 
-Per view: cull by time, opacity and depth; radix-sort the survivors by depth; project them in that order; bin
-them into tiles (exactly: a tile is entered only where the ellipse reaches it, Speedy-Splat's AccuTile); blend
-every tile front to back. Within a tile a Gaussian visits just the rows, and on each row just the span of
-pixels, where its alpha reaches 1/255. The backward pass walks the tile lists back to front and recovers each
-transmittance by division. Every (tile, Gaussian) pair owns one row of a gradient buffer, which is then summed
-in a fixed order: no atomics, and the same bits on every run and for any number of threads.
+Per view: cull by time, opacity and depth; project the survivors; sort them by depth; bin them into tiles (exactly: a
+tile is entered only where the ellipse reaches it, Speedy-Splat's AccuTile); blend every tile front to back. Within a
+tile a Gaussian visits just the rows, and on each row just the span of pixels, where its alpha reaches 1/255. The
+backward pass walks the tile lists back to front and recovers each transmittance by division. Every (tile, Gaussian)
+pair owns one row of a gradient buffer, and they are summed in a fixed order: no atomics, and the same bits on every
+run and for any number of threads.
 """
 
 # ruff: noqa: I001 (one line of constants, not twenty)
@@ -21,16 +21,24 @@ import torch
 from ..threads import each
 from . import ALPHA_MAX, T_STOP, project
 from .project import (
-    BLUE, E_MIN, F32, GREEN, HU, HUU, HUV, HV, HVV, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE,
-    UX, UY, VY, H, serial,
+    BLUE, E_MIN, F32, GREEN, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE, UX, UY, VY, serial,
 )  # fmt: skip
-from .simd import any_lane, exp2, fma, load, ramp, select, splat, store, total
+from .simd import ROWS, bits, columns, exp2, fma, load, prefetch, rows, select, splat, store, store_totals, total
 
 CELL, ACROSS = 8, TILE // 8  # a tile is ACROSS² cells of CELL² pixels, so that what is hidden costs one look
-STRIDE = TILE + 8  # a span may run up to seven pixels over the tile's right edge, into scratch
+# A tile's state is planes of blocks of ROWS rows of pixels, whose rows take turns: see `_at`. A span may run up to
+# seven pixels over the tile's right edge, into scratch.
+PLANE = (TILE + 8) * ROWS
 HALF, SLACK = F32(0.5), F32(1e-3)  # slack: rounding of a span's ends; the pixels decide exactly
 HIGHEST, STOP, ZERO = F32(ALPHA_MAX), F32(T_STOP), F32(0)
-WIDE = 8  # from this width on (pixels, less one) each row finds its own span; below, the box is one step anyway
+WIDE = 32  # from this width on (pixels, less one) each row finds its own span; at 8 it took a half longer than it saved
+AHEAD = 8  # Gaussians: how far ahead memory is asked for
+
+
+@serial
+def _at(planes, x, y):
+    """Where a state of so many planes has the pixel (x, y) of the tile in its first plane."""
+    return y // ROWS * planes * PLANE + x * ROWS + y % ROWS
 
 
 @serial
@@ -43,15 +51,29 @@ def _inside(centre, half, x0, n):
 
 
 @serial
+def _span(mx, my, slope, vy, log, inverse, y, last, x0, w):
+    """The pixels [a, b] of [x0, x0 + w) that the block of rows from y on needs, the last one at most."""
+    a, b = x0 + w, -1
+    for k in range(ROWS):
+        dy = F32(min(y + k, last)) + HALF - my
+        v = vy * dy
+        left = log - v * v - E_MIN
+        low, high = _inside(mx - slope * dy, math.sqrt(max(left, ZERO)) * inverse + SLACK, x0, w)
+        if left > -SLACK and low <= high:
+            a, b = min(a, low), max(b, high)
+    return a, b
+
+
+@serial
 def _refresh(state, live):
     """Marks the cells where every pixel has stopped; how many have not."""
     count = 0
     for cell in range(ACROSS * ACROSS):
         if live[cell]:
-            at = cell // ACROSS * CELL * 5 * STRIDE + cell % ACROSS * CELL
+            at = _at(5, cell % ACROSS * CELL, cell // ACROSS * CELL)
             live[cell] = False
-            for y in range(CELL):
-                live[cell] |= any_lane(load(state, at + y * 5 * STRIDE) > splat(ZERO))
+            for y in range(0, CELL, ROWS):
+                live[cell] |= bits(load(state, at + y // ROWS * 5 * PLANE) > splat(ZERO)) != 0
             count += live[cell]
     return count
 
@@ -68,168 +90,174 @@ def _reaches(cells, least, a, b, top, bottom):
 
 @serial
 def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
-    """Blends one tile into state, planes T r g b index by row of pixels. T < 0: stopped with |T| left."""
+    """Blends one tile into state, planes T r g b index by block of rows. T < 0: stopped with |T| left."""
     state[:] = 0
     live[:] = 1
     for y in range(h):
+        at = _at(5, 0, y)
         for x in range(w):
-            state[y * 5 * STRIDE + x] = 1
+            state[at + x * ROWS] = 1
     zero, lowest, highest, stop = splat(F32(0)), splat(E_MIN), splat(HIGHEST), splat(STOP)
     for i in range(first, last):
         if (i - first) % 64 == 0 and _refresh(state, live) == 0:
             break
+        if i + AHEAD < last:
+            prefetch(P, pairs[i + AHEAD])
         r = pairs[i]
-        ux, red, green, blue = splat(P[r, UX]), splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE])
-        index = splat(F32(i - first + 1))
-        mx, my, uy, vy, log = P[r, MX], P[r, MY], P[r, UY], P[r, VY], P[r, LOG]
-        inverse, slope = P[r, INVERSE], P[r, SLOPE]
+        mx, my, ux, uy, vy = P[r, MX], P[r, MY], P[r, UX], P[r, UY], P[r, VY]
         top, bottom = _inside(my, P[r, REACH_Y], y0, h)
         a, b = _inside(mx, P[r, REACH_X], x0, w)
         if not _reaches(live, 1, a - x0, b - x0, top - y0, bottom - y0):
             continue
         wide = b - a >= WIDE
-        for y in range(top, bottom + 1):
-            dy = F32(y) + HALF - my
-            v = vy * dy
-            k = log - v * v
+        red, green, blue, log = splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE]), splat(P[r, LOG])
+        index = splat(F32(i - first + 1))
+        u0, v0 = fma(splat(ux), columns(), splat(uy) * rows()), splat(vy) * rows()
+        for y in range(top - top % ROWS, bottom + 1, ROWS):
             if wide:
-                a, b = _inside(mx - slope * dy, math.sqrt(max(k - E_MIN, ZERO)) * inverse + SLACK, x0, w)
-            row = (y - y0) * 5 * STRIDE - x0
+                a, b = _span(mx, my, P[r, SLOPE], vy, P[r, LOG], P[r, INVERSE], y, y0 + h - 1, x0, w)
+            dy = F32(y) + HALF - my
+            v = v0 + splat(vy * dy)
+            k = fma(-v, v, log)
+            row = _at(5, -x0, y - y0)
             for x in range(a, b + 1, 8):
-                at = row + x
+                at = row + x * ROWS
                 T = load(state, at)
-                if not any_lane(zero < T):
+                alive = zero < T
+                if bits(alive) == 0:
                     continue
-                u = fma(ux, ramp() + splat(F32(x) + HALF - mx), splat(uy * dy))
-                e = fma(-u, u, splat(k))
+                u = u0 + splat(ux * (F32(x) + HALF - mx) + uy * dy)
+                e = fma(-u, u, k)
                 alpha = exp2(e)
                 alpha = select(alpha > highest, highest, alpha)
                 after = fma(-alpha, T, T)
                 reached = e >= lowest
                 go = reached & (after > stop)
                 weight = select(go, alpha * T, zero)
-                stopped = select(reached & (zero < T), -T, T)
+                stopped = select(reached & alive, -T, T)
                 store(state, at, select(go, after, stopped))
-                at += STRIDE
+                at += PLANE
                 store(state, at, fma(weight, red, load(state, at)))
-                at += STRIDE
+                at += PLANE
                 store(state, at, fma(weight, green, load(state, at)))
-                at += STRIDE
+                at += PLANE
                 store(state, at, fma(weight, blue, load(state, at)))
-                at += STRIDE
+                at += PLANE
                 store(state, at, select(go, index, load(state, at)))
 
 
 @serial
-def _unblend(P, pairs, first, last, x0, y0, w, h, state, deep, sums):
+def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
     """Backward through one tile: state has planes T, B (the colour behind, dotted with the gradient, over its
-    own transmittance), dL/dr, dL/dg, dL/db, index; deep: the highest index per cell. Writes the rows
-    [first, last) of sums."""
+    own transmittance), dL/dr, dL/dg, dL/db, index; deep: the highest index per cell. Writes the pairs' rows of
+    sums, those of hidden pairs excepted."""
     zero, one, lowest, highest = splat(F32(0)), splat(F32(1)), splat(E_MIN), splat(HIGHEST)
+    flat = sums.reshape(-1)
     for i in range(last - 1, first - 1, -1):
+        if i - AHEAD >= first:
+            prefetch(P, pairs[i - AHEAD])
+            prefetch(sums, slots[i - AHEAD])
         r = pairs[i]
-        ux, red, green, blue = splat(P[r, UX]), splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE])
-        index = splat(F32(i - first + 1))
-        s_red, s_green, s_blue, s_h, s_hu, s_hv = zero, zero, zero, zero, zero, zero
-        s_huu, s_huv, s_hvv = zero, zero, zero
-        mx, my, uy, vy, log = P[r, MX], P[r, MY], P[r, UY], P[r, VY], P[r, LOG]
-        inverse, slope = P[r, INVERSE], P[r, SLOPE]
+        mx, my, ux, uy, vy = P[r, MX], P[r, MY], P[r, UX], P[r, UY], P[r, VY]
         top, bottom = _inside(my, P[r, REACH_Y], y0, h)
         a, b = _inside(mx, P[r, REACH_X], x0, w)
         if not _reaches(deep, i - first + 1, a - x0, b - x0, top - y0, bottom - y0):
-            sums[i] = 0
             continue
         wide = b - a >= WIDE
-        for y in range(top, bottom + 1):
-            dy = F32(y) + HALF - my
-            v = vy * dy
-            k = log - v * v
+        red, green, blue, log = splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE]), splat(P[r, LOG])
+        index = splat(F32(i - first + 1))
+        u0, v0 = fma(splat(ux), columns(), splat(uy) * rows()), splat(vy) * rows()
+        s_red, s_green, s_blue, s_h, s_hu, s_hv = zero, zero, zero, zero, zero, zero
+        s_huu, s_huv, s_hvv = zero, zero, zero
+        for y in range(top - top % ROWS, bottom + 1, ROWS):
             if wide:
-                a, b = _inside(mx - slope * dy, math.sqrt(max(k - E_MIN, ZERO)) * inverse + SLACK, x0, w)
-            row = (y - y0) * 6 * STRIDE - x0
+                a, b = _span(mx, my, P[r, SLOPE], vy, P[r, LOG], P[r, INVERSE], y, y0 + h - 1, x0, w)
+            dy = F32(y) + HALF - my
+            v = v0 + splat(vy * dy)
+            k = fma(-v, v, log)
+            row = _at(6, -x0, y - y0)
             for x in range(a, b + 1, 8):
-                at = row + x
-                seen = load(state, at + 5 * STRIDE) >= index
-                if not any_lane(seen):
+                at = row + x * ROWS
+                seen = load(state, at + 5 * PLANE) >= index
+                if bits(seen) == 0:
                     continue
-                u = fma(ux, ramp() + splat(F32(x) + HALF - mx), splat(uy * dy))
-                e = fma(-u, u, splat(k))
+                u = u0 + splat(ux * (F32(x) + HALF - mx) + uy * dy)
+                e = fma(-u, u, k)
                 raw = exp2(e)
                 alpha = select((e >= lowest) & seen, select(raw > highest, highest, raw), zero)
-                T, B = load(state, at) / (one - alpha), load(state, at + STRIDE)
-                g_red, g_green = load(state, at + 2 * STRIDE), load(state, at + 3 * STRIDE)
-                g_blue = load(state, at + 4 * STRIDE)
+                T, B = load(state, at) / (one - alpha), load(state, at + PLANE)
+                g_red, g_green = load(state, at + 2 * PLANE), load(state, at + 3 * PLANE)
+                g_blue = load(state, at + 4 * PLANE)
                 weight = alpha * T
                 d = fma(red, g_red, fma(green, g_green, fma(blue, g_blue, -B)))
                 store(state, at, T)
-                store(state, at + STRIDE, fma(alpha, d, B))
+                store(state, at + PLANE, fma(alpha, d, B))
                 s_red, s_green = fma(weight, g_red, s_red), fma(weight, g_green, s_green)
                 s_blue = fma(weight, g_blue, s_blue)
                 g = select(highest >= raw, weight * d, zero)  # dL/d(ln alpha); the clamp stops it
-                gu, gv, vv = g * u, g * splat(v), splat(v)
+                gu, gv = g * u, g * v
                 s_h, s_hu, s_hv = s_h + g, s_hu + gu, s_hv + gv
-                s_huu, s_huv, s_hvv = fma(gu, u, s_huu), fma(gu, vv, s_huv), fma(gv, vv, s_hvv)
-        sums[i, 0], sums[i, 1], sums[i, 2] = total(s_red), total(s_green), total(s_blue)
-        sums[i, H], sums[i, HU], sums[i, HV] = total(s_h), total(s_hu), total(s_hv)
-        sums[i, HUU], sums[i, HUV], sums[i, HVV] = total(s_huu), total(s_huv), total(s_hvv)
+                s_huu, s_huv, s_hvv = fma(gu, u, s_huu), fma(gu, v, s_huv), fma(gv, v, s_hvv)
+        at = slots[i] * SUMS
+        store_totals(flat, at, s_red, s_green, s_blue, s_h, s_hu, s_hv, s_huu, s_huv)
+        flat[at + 8] = total(s_hvv)
 
 
 @serial
-def _blend_tiles(tiles, P, starts, pairs, background, image, alpha, left, index):
-    """Renders the tiles of one view; left: what the transmittance ends at; index: the last one drawn, from 1."""
+def _blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
+    """Renders the tiles of one view; kept: per tile, the planes of what the transmittance ends at and of the last
+    one drawn, from 1."""
     height, width = alpha.shape
     across = (width + TILE - 1) // TILE
-    state, live = np.empty(TILE * 5 * STRIDE, np.float32), np.empty(ACROSS * ACROSS, np.uint8)
+    state, live = np.empty(TILE // ROWS * 5 * PLANE, np.float32), np.empty(ACROSS * ACROSS, np.uint8)
+    red, green, blue = background[0], background[1], background[2]
     for j in range(tiles[0], tiles[1]):
         x0, y0 = j % across * TILE, j // across * TILE
         w, h = min(TILE, width - x0), min(TILE, height - y0)
         _blend(P, pairs, starts[j], starts[j + 1], x0, y0, w, h, state, live)
         for y in range(h):
+            at = _at(5, 0, y)
             for x in range(w):
-                at = y * 5 * STRIDE + x
                 T = abs(state[at])
-                left[y0 + y, x0 + x], alpha[y0 + y, x0 + x] = T, F32(1) - T
-                index[y0 + y, x0 + x] = state[at + 4 * STRIDE]
-                for k in range(3):
-                    image[y0 + y, x0 + x, k] = state[at + (k + 1) * STRIDE] + T * background[k]
+                alpha[y0 + y, x0 + x] = F32(1) - T
+                image[y0 + y, x0 + x, 0] = state[at + PLANE] + T * red
+                image[y0 + y, x0 + x, 1] = state[at + 2 * PLANE] + T * green
+                image[y0 + y, x0 + x, 2] = state[at + 3 * PLANE] + T * blue
+                at += ROWS
+        for y in range((h + ROWS - 1) // ROWS):
+            for x in range(PLANE):
+                kept[j, y, 0, x] = abs(state[y * 5 * PLANE + x])
+                kept[j, y, 1, x] = state[(y * 5 + 4) * PLANE + x]
 
 
 @serial
-def _unblend_tiles(tiles, P, starts, pairs, background, g_image, g_alpha, left, index, used, sums):
-    """Backward through the tiles of one view: the rows [starts[j], used[j]) of sums."""
-    height, width = left.shape
+def _unblend_tiles(tiles, P, starts, pairs, slots, background, g_image, g_alpha, kept, sums):
+    """Backward through the tiles of one view."""
+    height, width = g_alpha.shape
     across = (width + TILE - 1) // TILE
-    state, deep = np.zeros(TILE * 6 * STRIDE, np.float32), np.empty(ACROSS * ACROSS, np.int64)
+    state, deep = np.zeros(TILE // ROWS * 6 * PLANE, np.float32), np.empty(ACROSS * ACROSS, np.float32)
+    red, green, blue = background[0], background[1], background[2]
     for j in range(tiles[0], tiles[1]):
         x0, y0 = j % across * TILE, j // across * TILE
         w, h = min(TILE, width - x0), min(TILE, height - y0)
         deep[:] = 0
-        for y in range(h):
+        for y in range((h + ROWS - 1) // ROWS):
+            for x in range(PLANE):
+                state[y * 6 * PLANE + x] = kept[j, y, 0, x]
+                state[(y * 6 + 5) * PLANE + x] = kept[j, y, 1, x]
             for x in range(w):
-                at = y * 6 * STRIDE + x
-                behind = -g_alpha[y0 + y, x0 + x]
-                for k in range(3):
-                    g = g_image[y0 + y, x0 + x, k]
-                    state[at + (2 + k) * STRIDE] = g
-                    behind += g * background[k]
-                state[at], state[at + STRIDE] = left[y0 + y, x0 + x], behind
-                state[at + 5 * STRIDE] = index[y0 + y, x0 + x]
-                cell = y // CELL * ACROSS + x // CELL
-                deep[cell] = max(deep[cell], int(index[y0 + y, x0 + x]))
-        used[j] = starts[j] + deep.max()
-        _unblend(P, pairs, starts[j], used[j], x0, y0, w, h, state, deep, sums)
-
-
-@serial
-def _add_tiles(rows, starts, used, pairs, sums):
-    """-> (rows, SUMS): the tiles' gradients of every Gaussian of a view added up, tile after tile."""
-    S = np.zeros((rows, SUMS), np.float32)
-    for j in range(len(used)):
-        for i in range(starts[j], used[j]):
-            r = pairs[i]
-            for k in range(SUMS):
-                S[r, k] += sums[i, k]
-    return S
+                cell = y * ROWS // CELL * ACROSS + x // CELL
+                for k in range(ROWS):
+                    deep[cell] = max(deep[cell], kept[j, y, 1, x * ROWS + k])
+        for y in range(h):
+            at = _at(6, 0, y)
+            for x in range(w):
+                r, g, b = g_image[y0 + y, x0 + x, 0], g_image[y0 + y, x0 + x, 1], g_image[y0 + y, x0 + x, 2]
+                state[at + PLANE] = r * red + g * green + b * blue - g_alpha[y0 + y, x0 + x]
+                state[at + 2 * PLANE], state[at + 3 * PLANE], state[at + 4 * PLANE] = r, g, b
+                at += ROWS
+        used = starts[j] + int(deep.max())
+        _unblend(P, pairs, slots, starts[j], used, x0, y0, w, h, state, deep, sums)
 
 
 def _bands(width, height):
@@ -238,62 +266,68 @@ def _bands(width, height):
     return [(k * across, k * across + across) for k in range(down)]
 
 
-def _arrays(tensors, dtype=torch.float32):
-    return tuple(x.detach().to(dtype).contiguous().numpy() for x in tensors)
+def _array(x, dtype=torch.float32):
+    """A contiguous array of a CPU tensor; its own memory where that will do."""
+    x = x.detach()
+    return (x if x.dtype == dtype and x.is_contiguous() else x.to(dtype).contiguous()).numpy()
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, *args):
-        cameras, (size, background, inference) = args[7:10], args[10:]
-        ctx.save_for_backward(*args[:7])  # so that torch notices if they are changed in place before backward
-        inputs = _arrays(args[:7])
-        cameras = _arrays(cameras, torch.float64)
-        (background,) = _arrays([background])
+    def forward(ctx, inputs, cameras, size, background, inference, *tensors):
+        ctx.save_for_backward(*tensors)  # so that torch notices if they are changed in place before backward
         (width, height), views = size, len(cameras[0])
-        shape = (views, height, width)
-        image, alpha, left, index = (np.empty(s, np.float32) for s in ((*shape, 3), shape, shape, shape))
-        rows = each(
+        tiles = -(-width // TILE) * -(-height // TILE)
+        image, alpha = np.empty((views, height, width, 3), np.float32), np.empty((views, height, width), np.float32)
+        kept = np.empty((views, tiles, TILE // ROWS, 2, PLANE), np.float32)
+        drawn = each(
             [(c,) for c in range(views)],
-            lambda c: project.project_view(c, *inputs, *cameras, width, height, inference),
-        )  # per view: ids, P, starts, pairs
+            lambda c: project.project_view(c, inputs, cameras, width, height, inference),
+        )  # per view: ids, P, starts, pairs, slots, first
 
         def blend(c, band):
-            _blend_tiles(band, *rows[c][1:], background, image[c], alpha[c], left[c], index[c])
+            _, P, starts, pairs, _, _ = drawn[c]
+            _blend_tiles(band, P, starts, pairs, background, image[c], alpha[c], kept[c])
 
         each(itertools.product(range(views), _bands(width, height)), blend)
-        ctx.saved = cameras, background, rows, left, index
-        return torch.from_numpy(image).to(args[0].dtype), torch.from_numpy(alpha).to(args[0].dtype)
+        ctx.saved = inputs, cameras, size, background, drawn, kept
+        dtype = tensors[0].dtype
+        return torch.from_numpy(image).to(dtype), torch.from_numpy(alpha).to(dtype)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        inputs, (cameras, background, rows, left, index) = _arrays(ctx.saved_tensors), ctx.saved
-        g_image, g_alpha = _arrays(grads)
-        views, height, width = left.shape
-        used = [np.zeros(len(starts) - 1, np.int64) for _, _, starts, _ in rows]
-        sums = [np.empty((len(pairs), SUMS), np.float32) for _, _, _, pairs in rows]
+    def backward(ctx, g_image, g_alpha):
+        tensors, (inputs, cameras, (width, height), background, drawn, kept) = ctx.saved_tensors, ctx.saved
+        g_image, g_alpha, views = _array(g_image), _array(g_alpha), len(drawn)
+        sums = [np.zeros((len(pairs), SUMS), np.float32) for _, _, _, pairs, _, _ in drawn]
 
         def unblend(c, band):
-            _unblend_tiles(band, *rows[c][1:], background, g_image[c], g_alpha[c], left[c], index[c], used[c], sums[c])
+            _, P, starts, pairs, slots, _ = drawn[c]
+            _unblend_tiles(band, P, starts, pairs, slots, background, g_image[c], g_alpha[c], kept[c], sums[c])
 
         each(itertools.product(range(views), _bands(width, height)), unblend)
-        added = each(
-            [(c,) for c in range(views)],
-            lambda c: _add_tiles(len(rows[c][0]), rows[c][2], used[c], rows[c][3], sums[c]),
-        )
-        out = tuple(np.zeros_like(x) for x in inputs)
-        count, parts = len(inputs[0]), torch.get_num_threads()
+        out = tuple(None if x is None else np.zeros_like(x) for x in inputs)
+        count, parts = len(inputs[1]), torch.get_num_threads()
 
         def chain(part):  # every Gaussian has one owner, who adds the views in their order
             own = part * count // parts, (part + 1) * count // parts
-            for c in range(views):
-                project.chain(c, own, rows[c][0], rows[c][1], added[c], *inputs, *cameras, width, height, out)
+            for c, (ids, _, _, _, _, first) in enumerate(drawn):
+                project.chain(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
 
         each([(k,) for k in range(parts)], chain)
-        return *(torch.from_numpy(x).to(y.dtype) for x, y in zip(out, ctx.saved_tensors, strict=True)), *([None] * 6)
+        grads = (torch.from_numpy(x) for x in out if x is not None)
+        return *[None] * 5, *(g.view(x.shape).to(x.dtype) for g, x in zip(grads, tensors, strict=True))
 
 
 def rasterize(*args):
-    """See `timesplat.model.rasterize.rasterize`; after the cameras: (width, height), background (3,), inference."""
-    return _Rasterize.apply(*args)
+    """See `timesplat.model.rasterize.rasterize`: xyz, t, velocity, sigma_t, covariance (or scale (N,3) and quaternion
+    (N,4)), rgb, opacity; c2w, intrinsics, time; then (width, height), background (3,), inference.
+    None where an input is not finite in float32."""
+    *tensors, c2w, intrinsics, time, size, background, inference = args
+    inputs = tuple(_array(x).reshape(-1) for x in tensors)
+    cameras = tuple(_array(x, torch.float64) for x in (c2w, intrinsics, time))
+    if not (project.all_finite(inputs) and all(np.isfinite(x).all() for x in cameras)):
+        return None
+    if len(inputs) == 7:
+        inputs = (*inputs[:5], None, *inputs[5:])  # no quaternions
+    return _Rasterize.apply(inputs, cameras, size, _array(background), inference, *tensors)

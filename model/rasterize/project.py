@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU backend's per-Gaussian half: cull, sort, project, bin; and the chain rule back to the seven inputs.
+"""The CPU backend's per-Gaussian half: cull, project, sort, bin; and the chain rule back to the inputs.
 
-Scalar float64 code: a few hundred flops per Gaussian and view are little beside its pixels, and near cameras
-and thin Gaussians need the digits. Loops live inside the functions that take arrays: numba counts references
-on every call, which two threads would fight over.
+Eight Gaussians at a time, in the order of the input, so that memory is read from one end to the other; in float64,
+because near cameras and thin Gaussians need the digits. Loops live inside the functions that take arrays: numba counts
+references on every call, which two threads would fight over.
 """
 
 from __future__ import annotations
@@ -14,19 +14,21 @@ import numpy as np
 from numba import njit
 
 from . import ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR
+from .simd import bits, gather, load_doubles, log2, select, splat, sqrt, store
 
-TILE = 64  # pixels a side; of 16, 32 and 64 the fastest at 128²
+TILE = 64  # pixels a side
 F32 = np.float32
 LOG2E = math.log2(math.e)
 E_MIN = F32(math.log2(ALPHA_MIN))
+E_FILTER = math.log2(FILTER)
 # TRAP: numba's cache watches only the file that a function is in. After a change to a constant above or to
 # simd.py, touch the files that use it.
 serial = njit(cache=True, nogil=True, error_model="numpy")
 
-# One row per surviving Gaussian and view, in depth order. (u, v) = L d whitens the pixel offset d = (dx, dy),
+# One row per Gaussian that a view shows, in the order of the input. (u, v) = L d whitens the pixel offset d = (dx, dy),
 # L = [[UX, UY], [0, VY]], scaled so that alpha = 2^(LOG - u² - v²). INVERSE = 1 / UX; SLOPE = UY / UX.
-# REACH: half sides of the box where alpha >= 1/255 (x: -1 outside the image); TILT: dy of its rightmost point.
-MX, MY, UX, UY, VY, LOG, RED, GREEN, BLUE, REACH_X, REACH_Y, TILT, INVERSE, SLOPE = range(14)
+# REACH: half sides of the box where alpha >= 1/255; TILT: dy of its rightmost point. Then the depth.
+MX, MY, UX, UY, VY, LOG, RED, GREEN, BLUE, REACH_X, REACH_Y, TILT, INVERSE, SLOPE, DEPTH = range(15)
 PARAMS = 16
 # Sums over pixels, per (tile, Gaussian) pair: d/d(r, g, b), then of h = dL/d(ln alpha) the moments in u and v.
 H, HU, HV, HUU, HUV, HVV = range(3, 9)
@@ -34,61 +36,41 @@ SUMS = 9
 
 
 @serial
-def _cull(c, xyz, t, velocity, sigma_t, opacity, c2w, time, inference):
-    """Ids and float32 depths of the Gaussians that may be seen from view c, in the order of the input."""
-    zx, zy, zz = c2w[c, 0, 2], c2w[c, 1, 2], c2w[c, 2, 2]
-    cx, cy, cz, now = c2w[c, 0, 3], c2w[c, 1, 3], c2w[c, 2, 3], time[c]
-    ids, depths, count = np.empty(len(t), np.int32), np.empty(len(t), np.float32), 0
-    for n in range(len(t)):
-        dt = now - t[n]
-        e = 0.5 * (dt / sigma_t[n]) ** 2
-        o = np.float64(opacity[n])
-        if e > 5.55 + max(o - 1, 0.0):  # > ln(255 o)
-            continue
-        marginal = math.exp(-e)
-        if o * marginal < ALPHA_MIN or (inference and (marginal < FILTER or o * marginal < FILTER)):
-            continue
-        x, y = xyz[n, 0] + velocity[n, 0] * dt - cx, xyz[n, 1] + velocity[n, 1] * dt - cy
-        z = zx * x + zy * y + zz * (xyz[n, 2] + velocity[n, 2] * dt - cz)
-        if z >= NEAR:
-            ids[count], depths[count] = n, z
-            count += 1
-    return ids[:count], depths[:count]
+def all_finite(arrays):
+    """Whether 1D float32 arrays hold neither NaN nor infinity."""
+    bad = 0
+    for x in arrays:
+        for v in x.view(np.uint32):
+            bad |= (v & np.uint32(0x7F800000)) == np.uint32(0x7F800000)
+    return bad == 0
 
 
 @serial
-def _sort(ids, depths):
-    """ids by depth: a radix sort of the floats' bits (which sort as positive floats do), three stable passes of
-    11 bits, so equal depths stay in the order of the input."""
-    a, ka, m = ids, depths.view(np.uint32), len(ids)
-    b, kb = np.empty_like(a), np.empty_like(ka)
-    for digit in range(3):
-        shift = np.uint32(11 * digit)
-        at = np.zeros(2049, np.int64)
-        for i in range(m):
-            at[((ka[i] >> shift) & np.uint32(2047)) + 1] += 1
-        for i in range(2048):
-            at[i + 1] += at[i]
-        for i in range(m):
-            d = (ka[i] >> shift) & np.uint32(2047)
-            b[at[d]], kb[at[d]] = a[i], ka[i]
-            at[d] += 1
-        a, b, ka, kb = b, a, kb, ka
-    return a
+def _cull(now, t, sigma_t, opacity, inference):
+    """Ids of the Gaussians that may be alive at a time, in the order of the input, and seven more to read over the end;
+    how many. A quick look: `_prepare` is exact."""
+    ids, count = np.empty(len(t) + 8, np.int32), 0
+    most = 2.9958 if inference else 5.5413  # -ln 0.05, ln 255, rounded up
+    for n in range(len(t)):
+        d = (now - t[n]) / sigma_t[n]
+        ids[count] = n
+        count += 0.5 * d * d <= most + max(np.float64(opacity[n]) - 1, 0.0)
+    ids[count : count + 8] = ids[max(count - 1, 0)]
+    return ids, count
 
 
 @serial
 def _camera(c, c2w, intrinsics, width, height):
-    """Axes x y z (3 each), centre (3), fx fy cx cy, and the slopes' lower and upper bounds in x and y."""
+    """In all lanes: axes x y z (3 each), centre (3), fx fy cx cy, and the slopes' bounds in x and y."""
     fx, fy, cx, cy = intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3]
     mx, my = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
     return (
-        (c2w[c, 0, 0], c2w[c, 1, 0], c2w[c, 2, 0]),
-        (c2w[c, 0, 1], c2w[c, 1, 1], c2w[c, 2, 1]),
-        (c2w[c, 0, 2], c2w[c, 1, 2], c2w[c, 2, 2]),
-        (c2w[c, 0, 3], c2w[c, 1, 3], c2w[c, 2, 3]),
-        (fx, fy, cx, cy),
-        (-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my),
+        (splat(c2w[c, 0, 0]), splat(c2w[c, 1, 0]), splat(c2w[c, 2, 0])),
+        (splat(c2w[c, 0, 1]), splat(c2w[c, 1, 1]), splat(c2w[c, 2, 1])),
+        (splat(c2w[c, 0, 2]), splat(c2w[c, 1, 2]), splat(c2w[c, 2, 2])),
+        (splat(c2w[c, 0, 3]), splat(c2w[c, 1, 3]), splat(c2w[c, 2, 3])),
+        (splat(fx), splat(fy), splat(cx), splat(cy)),
+        (splat(-cx / fx - mx), splat((width - cx) / fx + mx), splat(-cy / fy - my), splat((height - cy) / fy + my)),
     )
 
 
@@ -104,62 +86,158 @@ def _times(m, s):
 
 
 @serial
+def _clamp(x, low, high):
+    x = select(x > low, x, low)
+    return select(x < high, x, high)
+
+
+@serial
 def _project(camera, mean, cov):
     """-> camera-space centre, clamped slopes, the rows m, k of M = J W, the rows of M Σ, Σ₂ = M Σ Mᵀ + blur."""
     ax, ay, az, centre, (fx, fy, _, _), bounds = camera
     d = (mean[0] - centre[0], mean[1] - centre[1], mean[2] - centre[2])
     p = (_dot(ax, d), _dot(ay, d), _dot(az, d))
-    rz = 1 / p[2]
-    sx = min(max(p[0] * rz, bounds[0]), bounds[1])
-    sy = min(max(p[1] * rz, bounds[2]), bounds[3])
+    rz = splat(1.0) / p[2]
+    sx, sy = _clamp(p[0] * rz, bounds[0], bounds[1]), _clamp(p[1] * rz, bounds[2], bounds[3])
     jx, jy = fx * rz, fy * rz
     m = (jx * (ax[0] - sx * az[0]), jx * (ax[1] - sx * az[1]), jx * (ax[2] - sx * az[2]))
     k = (jy * (ay[0] - sy * az[0]), jy * (ay[1] - sy * az[1]), jy * (ay[2] - sy * az[2]))
     ms, ks = _times(m, cov), _times(k, cov)
-    return p, (sx, sy), (m, k), (ms, ks), (_dot(ms, m) + BLUR, _dot(ms, k), _dot(ks, k) + BLUR)
+    blur = splat(BLUR)
+    return p, (sx, sy), (m, k), (ms, ks), (_dot(ms, m) + blur, _dot(ms, k), _dot(ks, k) + blur)
 
 
 @serial
-def _gather(n, dt, xyz, velocity, cov):
-    """Mean at dt after its own time, and the symmetric part of Σ_3 as (xx, xy, xz, yy, yz, zz)."""
-    return (
-        (xyz[n, 0] + velocity[n, 0] * dt, xyz[n, 1] + velocity[n, 1] * dt, xyz[n, 2] + velocity[n, 2] * dt),
-        (
-            np.float64(cov[n, 0, 0]),
-            0.5 * (np.float64(cov[n, 0, 1]) + cov[n, 1, 0]),
-            0.5 * (np.float64(cov[n, 0, 2]) + cov[n, 2, 0]),
-            np.float64(cov[n, 1, 1]),
-            0.5 * (np.float64(cov[n, 1, 2]) + cov[n, 2, 1]),
-            np.float64(cov[n, 2, 2]),
-        ),
+def _axes(shape, rotation, ids, at):
+    """Quaternion and scale of eight Gaussians, and the rotation's rows."""
+    two, one = splat(2.0), splat(1.0)
+    w, x = gather(rotation, ids, at, 4, 0), gather(rotation, ids, at, 4, 1)
+    y, z = gather(rotation, ids, at, 4, 2), gather(rotation, ids, at, 4, 3)
+    scale = gather(shape, ids, at, 3, 0), gather(shape, ids, at, 3, 1), gather(shape, ids, at, 3, 2)
+    R = (
+        (one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
+        (two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)),
+        (two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)),
+    )
+    return (w, x, y, z), scale, R
+
+
+@serial
+def _covariance(shape, rotation, ids, at):
+    """(xx, xy, xz, yy, yz, zz) of eight Gaussians: from scale (3) and quaternion (4), or where that is None the
+    symmetric part of Σ_3 (9)."""
+    if rotation is None:
+        half = splat(0.5)
+        return (
+            gather(shape, ids, at, 9, 0),
+            half * (gather(shape, ids, at, 9, 1) + gather(shape, ids, at, 9, 3)),
+            half * (gather(shape, ids, at, 9, 2) + gather(shape, ids, at, 9, 6)),
+            gather(shape, ids, at, 9, 4),
+            half * (gather(shape, ids, at, 9, 5) + gather(shape, ids, at, 9, 7)),
+            gather(shape, ids, at, 9, 8),
+        )
+    else:
+        _, s, (a, b, c) = _axes(shape, rotation, ids, at)
+        v = (s[0] * s[0], s[1] * s[1], s[2] * s[2])
+        av, bv = (a[0] * v[0], a[1] * v[1], a[2] * v[2]), (b[0] * v[0], b[1] * v[1], b[2] * v[2])
+        cv = (c[0] * v[0], c[1] * v[1], c[2] * v[2])
+        return _dot(av, a), _dot(av, b), _dot(av, c), _dot(bv, b), _dot(bv, c), _dot(cv, c)
+
+
+@serial
+def _mean(ids, at, now, xyz, t, velocity):
+    """Time since its own and place of eight Gaussians."""
+    dt = now - gather(t, ids, at, 1, 0)
+    return dt, (
+        gather(xyz, ids, at, 3, 0) + gather(velocity, ids, at, 3, 0) * dt,
+        gather(xyz, ids, at, 3, 1) + gather(velocity, ids, at, 3, 1) * dt,
+        gather(xyz, ids, at, 3, 2) + gather(velocity, ids, at, 3, 2) * dt,
     )
 
 
 @serial
-def _prepare(c, ids, P, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intrinsics, time, width, height):
-    """Fills the rows of P for the Gaussians `ids` of view c."""
+def _prepare(
+    c, ids, count, P, xyz, t, velocity, sigma_t, shape, rotation, rgb, opacity, c2w, intrinsics, time, width, height,
+    inference,
+):  # fmt: skip
+    """Fills rows of P for those of the first `count` Gaussians `ids` that view c shows, whose ids move to the front;
+    how many."""
     camera = _camera(c, c2w, intrinsics, width, height)
-    scale = math.sqrt(0.5 * LOG2E)
-    for r in range(len(ids)):
-        n = ids[r]
-        dt = time[c] - t[n]
-        mean, cov3 = _gather(n, dt, xyz, velocity, cov)
-        p, _, _, _, (sxx, sxy, syy) = _project(camera, mean, cov3)
-        mx = camera[4][0] * p[0] / p[2] + camera[4][2]
-        my = camera[4][1] * p[1] / p[2] + camera[4][3]
-        log = math.log2(opacity[n]) - 0.5 * LOG2E * (dt / sigma_t[n]) ** 2
-        q = max(log - E_MIN, 0.0) * 2 / LOG2E  # squared Mahalanobis distance where alpha is 1/255
-        rx, ry = math.sqrt(q * sxx), math.sqrt(q * syy)
+    now, one, zero = splat(time[c]), splat(1.0), splat(0.0)
+    scale, least, filtered = splat(math.sqrt(0.5 * LOG2E)), splat(np.float64(E_MIN)), splat(E_FILTER)
+    w, h, near = splat(np.float64(width)), splat(np.float64(height)), splat(np.float64(NEAR))
+    lanes, kept = np.zeros(PARAMS * 8, np.float32), 0
+    for at in range(0, count, 8):
+        o = gather(opacity, ids, at, 1, 0)
+        dt, mean = _mean(ids, at, now, xyz, t, velocity)
+        d = dt / gather(sigma_t, ids, at, 1, 0)
+        marginal = splat(-0.5 * LOG2E) * d * d
+        log = log2(o) + marginal
+        p, _, _, _, (sxx, sxy, syy) = _project(camera, mean, _covariance(shape, rotation, ids, at))
+        rz = one / p[2]
+        mx, my = camera[4][0] * p[0] * rz + camera[4][2], camera[4][1] * p[1] * rz + camera[4][3]
+        q = (log - least) * splat(2 / LOG2E)  # squared Mahalanobis distance where alpha is 1/255
+        rx, ry = sqrt(q * sxx), sqrt(q * syy)
         det = sxx * syy - sxy * sxy
-        if not (mx + rx > 0 and mx - rx < width and my + ry > 0 and my - ry < height and det > 0):
-            P[r, REACH_X] = -1
+        seen = (o > zero) & (log >= least) & (p[2] >= near) & (det > zero)
+        seen = seen & (mx + rx > zero) & (w > mx - rx) & (my + ry > zero) & (h > my - ry)
+        if inference:
+            seen = seen & (marginal >= filtered) & (log >= filtered)
+        mask = bits(seen) & ((1 << min(count - at, 8)) - 1)
+        if mask == 0:
             continue
-        ux = scale * math.sqrt(syy / det)
-        P[r, MX], P[r, MY], P[r, LOG] = mx, my, log
-        P[r, UX], P[r, UY], P[r, VY] = ux, -ux * sxy / syy, scale / math.sqrt(syy)
-        P[r, INVERSE], P[r, SLOPE] = 1 / ux, -sxy / syy
-        P[r, RED], P[r, GREEN], P[r, BLUE] = rgb[n, 0], rgb[n, 1], rgb[n, 2]
-        P[r, REACH_X], P[r, REACH_Y], P[r, TILT] = rx, ry, sxy * math.sqrt(q / sxx)
+        ux = scale * sqrt(syy / det)
+        slope = -sxy / syy
+        store(lanes, MX * 8, mx)
+        store(lanes, MY * 8, my)
+        store(lanes, UX * 8, ux)
+        store(lanes, UY * 8, ux * slope)
+        store(lanes, VY * 8, scale / sqrt(syy))
+        store(lanes, LOG * 8, log)
+        store(lanes, RED * 8, gather(rgb, ids, at, 3, 0))
+        store(lanes, GREEN * 8, gather(rgb, ids, at, 3, 1))
+        store(lanes, BLUE * 8, gather(rgb, ids, at, 3, 2))
+        store(lanes, REACH_X * 8, rx)
+        store(lanes, REACH_Y * 8, ry)
+        store(lanes, TILT * 8, sxy * sqrt(q / sxx))
+        store(lanes, INVERSE * 8, one / ux)
+        store(lanes, SLOPE * 8, slope)
+        store(lanes, DEPTH * 8, p[2])
+        for lane in range(8):
+            if (mask >> lane) & 1:
+                ids[kept] = ids[at + lane]
+                for k in range(PARAMS):
+                    P[kept, k] = lanes[k * 8 + lane]
+                kept += 1
+    return kept
+
+
+@serial
+def _order(P):
+    """The rows of P by depth: a radix sort of the floats' bits (which sort as positive floats do), three stable passes
+    of 11 bits, so equal depths stay in the order of the input."""
+    m = len(P)
+    a, ka = np.empty(m, np.int32), np.empty(m, np.float32)
+    for i in range(m):
+        a[i], ka[i] = i, P[i, DEPTH]
+    ka = ka.view(np.uint32)
+    b, kb = np.empty_like(a), np.empty_like(ka)
+    at = np.zeros((3, 2049), np.int64)
+    for i in range(m):
+        for digit in range(3):
+            at[digit, ((ka[i] >> np.uint32(11 * digit)) & np.uint32(2047)) + 1] += 1
+    for digit in range(3):
+        shift = np.uint32(11 * digit)
+        if m and at[digit, ((ka[0] >> shift) & np.uint32(2047)) + 1] == m:
+            continue  # the same in all
+        for i in range(2048):
+            at[digit, i + 1] += at[digit, i]
+        for i in range(m):
+            d = (ka[i] >> shift) & np.uint32(2047)
+            b[at[digit, d]], kb[at[digit, d]] = a[i], ka[i]
+            at[digit, d] += 1
+        a, b, ka, kb = b, a, kb, ka
+    return a
 
 
 @serial
@@ -170,21 +248,20 @@ def _tiles(low, high, n):
 
 @serial
 def _bin(P, width, height):
-    """-> starts (tiles + 1), pairs: tile j is reached by the rows pairs[starts[j] : starts[j + 1]] of P, in order.
-    Per row of tiles the exact extent of the ellipse in that band counts, not its box."""
+    """-> starts (tiles + 1), pairs, slots, first (rows + 1): tile j is reached by the rows pairs[starts[j] :
+    starts[j + 1]] of P, front to back. Every pair has a slot of its own (slots, like pairs), which for row r are
+    first[r] to first[r + 1]. Per row of tiles the exact extent of the ellipse in that band counts, not its box."""
     across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     bound, n = 0, 0  # by boxes; an array that grew in the loop would cost reference counts on every turn
     for r in range(len(P)):
-        if P[r, REACH_X] >= 0:
-            left, right = _tiles(P[r, MX] - P[r, REACH_X], P[r, MX] + P[r, REACH_X], width)
-            top, bottom = _tiles(P[r, MY] - P[r, REACH_Y], P[r, MY] + P[r, REACH_Y], height)
-            bound += (right - left + 2) * (bottom - top + 2)
-    tile, row = np.empty(bound, np.int32), np.empty(bound, np.int32)
+        left, right = _tiles(P[r, MX] - P[r, REACH_X], P[r, MX] + P[r, REACH_X], width)
+        top, bottom = _tiles(P[r, MY] - P[r, REACH_Y], P[r, MY] + P[r, REACH_Y], height)
+        bound += (right - left + 2) * (bottom - top + 2)
+    tile, first = np.empty(bound, np.int32), np.empty(len(P) + 1, np.int32)
     starts = np.zeros(across * down + 1, np.int64)
     for r in range(len(P)):
+        first[r] = n
         rx, ry = np.float64(P[r, REACH_X]), np.float64(P[r, REACH_Y])
-        if rx < 0:
-            continue
         mx, my = np.float64(P[r, MX]), np.float64(P[r, MY])
         top, bottom = _tiles(my - ry, my + ry, height)
         left, right = mx - rx, mx + rx
@@ -197,83 +274,193 @@ def _bin(P, width, height):
                 right = mx - P[r, SLOPE] * b + math.sqrt(max(s - (vy * b) ** 2, 0.0)) * P[r, INVERSE] + 0.01
                 if right < 0 or left > width:
                     continue
-            first, last = _tiles(left, right, width)
-            for tx in range(first, last + 1):
-                tile[n], row[n] = ty * across + tx, r
+            left_tile, right_tile = _tiles(left, right, width)
+            for tx in range(left_tile, right_tile + 1):
+                tile[n] = ty * across + tx
                 starts[tile[n] + 1] += 1
                 n += 1
+    first[len(P)] = n
     for j in range(across * down):
         starts[j + 1] += starts[j]
-    pairs, at = np.empty(n, np.int32), starts.copy()
-    for i in range(n):
-        pairs[at[tile[i]]] = row[i]
-        at[tile[i]] += 1
-    return starts, pairs
+    pairs, slots, at = np.empty(n, np.int32), np.empty(n, np.int32), starts.copy()
+    order = _order(P)
+    for i in range(len(P)):
+        r = order[i]
+        for slot in range(first[r], first[r + 1]):
+            j = tile[slot]
+            pairs[at[j]], slots[at[j]] = r, slot
+            at[j] += 1
+    return starts, pairs, slots, first
 
 
 @serial
-def project_view(c, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intrinsics, time, width, height, inference):
-    """View c -> ids of the K Gaussians in depth order, their rows P (K, PARAMS), and the tiles' lists of rows:
-    tile j has pairs[starts[j] : starts[j + 1]]."""
-    ids = _sort(*_cull(c, xyz, t, velocity, sigma_t, opacity, c2w, time, inference))
-    P = np.empty((len(ids), PARAMS), np.float32)
-    _prepare(c, ids, P, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intrinsics, time, width, height)
-    starts, pairs = _bin(P, width, height)
-    return ids, P, starts, pairs
+def project_view(c, inputs, cameras, width, height, inference):
+    """View c -> ids of the K Gaussians in it, in the order of the input, and seven more to read over the end; their
+    rows P (K, PARAMS); and starts, pairs, slots, first: see `_bin`."""
+    xyz, t, velocity, sigma_t, shape, rotation, rgb, opacity = inputs
+    c2w, intrinsics, time = cameras
+    ids, count = _cull(time[c], t, sigma_t, opacity, inference)
+    memory = np.empty((count + 1) * PARAMS, np.float32)
+    skip = -memory.ctypes.data % 64 // 4  # a row is a line of the cache
+    P = memory[skip : skip + count * PARAMS].reshape(count, PARAMS)
+    count = _prepare(
+        c, ids, count, P, xyz, t, velocity, sigma_t, shape, rotation, rgb, opacity, c2w, intrinsics, time, width,
+        height, inference,
+    )  # fmt: skip
+    P = P[:count]
+    starts, pairs, slots, first = _bin(P, width, height)
+    return ids[: count + 8], P, starts, pairs, slots, first
 
 
 @serial
-def chain(c, own, ids, P, S, xyz, t, velocity, sigma_t, cov, rgb, opacity, c2w, intrinsics, time, width, height, out):
-    """Adds to the gradients `out` of the seven inputs what the summed gradients S of view c's rows P say of the
+def _turn(q, g):
+    """The gradient of the quaternion q = (w, x, y, z) by that of its rotation's rows, g."""
+    w, x, y, z = q
+    a, b, c = g
+    two = splat(2.0)
+    return (
+        two * (x * (c[1] - b[2]) + y * (a[2] - c[0]) + z * (b[0] - a[1])),
+        two * (y * (a[1] + b[0]) + z * (a[2] + c[0]) + w * (c[1] - b[2]) - two * x * (b[1] + c[2])),
+        two * (x * (a[1] + b[0]) + z * (b[2] + c[1]) + w * (a[2] - c[0]) - two * y * (a[0] + c[2])),
+        two * (x * (a[2] + c[0]) + y * (b[2] + c[1]) + w * (b[0] - a[1]) - two * z * (a[0] + b[1])),
+    )
+
+
+@serial
+def _add(out, lanes, k, ids, size, part, count):
+    """out[ids[lane], part] += lanes[k, lane], out having rows of `size`."""
+    for lane in range(count):
+        out[ids[lane] * size + part] += lanes[k * 8 + lane]
+
+
+@serial
+def _store_shape(lanes, shape, rotation, ids, a, b, m, k):
+    """The gradient of Σ_3, aᵀ m + bᵀ k, to rows 9 on of lanes; or of scale to 9 on, of the quaternion to 12 on."""
+    if rotation is None:
+        for i in range(3):
+            for j in range(3):
+                store(lanes, (9 + 3 * i + j) * 8, a[i] * m[j] + b[i] * k[j])
+    else:
+        # Σ = A Aᵀ with A = R S, so dL/dA = 2 (dL/dΣ) R S =: 2 G S; dL/ds is the sum down a column of 2 G R S.
+        q, s, R = _axes(shape, rotation, ids, 0)
+        two = splat(2.0)
+        mR, kR = _row_times(m, R), _row_times(k, R)
+        G = (_outer_row(a[0], mR, b[0], kR), _outer_row(a[1], mR, b[1], kR), _outer_row(a[2], mR, b[2], kR))
+        v = (two * s[0] * s[0], two * s[1] * s[1], two * s[2] * s[2])
+        for i in range(3):
+            store(lanes, (9 + i) * 8, two * s[i] * (G[0][i] * R[0][i] + G[1][i] * R[1][i] + G[2][i] * R[2][i]))
+        g = _turn(q, (_scaled(G[0], v), _scaled(G[1], v), _scaled(G[2], v)))
+        for i in range(4):
+            store(lanes, (12 + i) * 8, g[i])
+
+
+@serial
+def _row_times(m, R):
+    return (
+        m[0] * R[0][0] + m[1] * R[1][0] + m[2] * R[2][0],
+        m[0] * R[0][1] + m[1] * R[1][1] + m[2] * R[2][1],
+        m[0] * R[0][2] + m[1] * R[1][2] + m[2] * R[2][2],
+    )
+
+
+@serial
+def _outer_row(a, m, b, k):
+    return a * m[0] + b * k[0], a * m[1] + b * k[1], a * m[2] + b * k[2]
+
+
+@serial
+def _scaled(a, v):
+    return a[0] * v[0], a[1] * v[1], a[2] * v[2]
+
+
+@serial
+def _add_shape(g_shape, g_rotation, lanes, ids, count):
+    if g_rotation is None:
+        for i in range(9):
+            _add(g_shape, lanes, 9 + i, ids, 9, i, count)
+    else:
+        for i in range(3):
+            _add(g_shape, lanes, 9 + i, ids, 3, i, count)
+        for i in range(4):
+            _add(g_rotation, lanes, 12 + i, ids, 4, i, count)
+
+
+@serial
+def chain(c, own, ids, first, sums, inputs, cameras, width, height, out):
+    """Adds to the gradients `out` of the inputs what the gradients `sums` of view c's pairs say of the
     Gaussians own[0] <= n < own[1]."""
-    g_xyz, g_t, g_velocity, g_sigma, g_cov, g_rgb, g_opacity = out
+    xyz, t, velocity, sigma_t, shape, rotation, _, opacity = inputs
+    g_xyz, g_t, g_velocity, g_sigma, g_shape, g_rotation, g_rgb, g_opacity = out
+    c2w, intrinsics, time = cameras
     camera = _camera(c, c2w, intrinsics, width, height)
     ax, ay, az, _, (fx, fy, _, _), _ = camera
-    for r in range(len(ids)):
-        n = ids[r]
-        if n < own[0] or n >= own[1]:
-            continue
-        h, hu, hv, huu, huv, hvv = S[r, H], S[r, HU], S[r, HV], S[r, HUU], S[r, HUV], S[r, HVV]
-        for i in range(3):
-            g_rgb[n, i] += S[r, i]
-        if h == 0 and huu == 0 and hvv == 0:
-            continue  # hidden
-        dt = time[c] - t[n]
-        mean, cov3 = _gather(n, dt, xyz, velocity, cov)
-        p, (sx, sy), (m, k), (ms, ks), _ = _project(camera, mean, cov3)
-        ux, uy, vy = np.float64(P[r, UX]), np.float64(P[r, UY]), np.float64(P[r, VY])
+    now, one, zero, two = splat(time[c]), splat(1.0), splat(0.0), splat(2.0)
+    f, scale = splat(2 / LOG2E), splat(math.sqrt(0.5 * LOG2E))
+    here, S, lanes = np.zeros(8, np.int32), np.zeros(SUMS * 8, np.float32), np.zeros(18 * 8, np.float32)
+    rows = len(ids) - 8
+    r, last = np.searchsorted(ids[:rows], own[0]), np.searchsorted(ids[:rows], own[1])
+    while r < last:
+        count = 0  # of the next eight that are not hidden
+        while count < 8 and r < last:
+            seen = False
+            for k in range(SUMS):
+                s = F32(0)
+                for slot in range(first[r], first[r + 1]):
+                    s += sums[slot, k]
+                S[k * 8 + count] = s
+                seen |= s != 0
+            here[count] = ids[r]
+            count += seen
+            r += 1
+        if count == 0:
+            break
+        here[count:] = here[0]
+        dt, mean = _mean(here, 0, now, xyz, t, velocity)
+        p, (sx, sy), (m, k), (ms, ks), (sxx, sxy, syy) = _project(camera, mean, _covariance(shape, rotation, here, 0))
+        ux = scale * sqrt(syy / (sxx * syy - sxy * sxy))
+        uy, vy = -ux * sxy / syy, scale / sqrt(syy)
+        h, hu, hv = load_doubles(S, H * 8), load_doubles(S, HU * 8), load_doubles(S, HV * 8)
+        huu, huv, hvv = load_doubles(S, HUU * 8), load_doubles(S, HUV * 8), load_doubles(S, HVV * 8)
         # ln alpha = ln o - ½ dᵀ Σ₂⁻¹ d: the mean's gradient is Lᵀ Σ h (u,v), the covariance's
         # ½ Lᵀ (Σ h (u,v)(u,v)ᵀ) L, where the stored L and (u,v) carry a factor sqrt(½ log2 e) each.
-        f = 2 / LOG2E
         gmx, gmy = f * hu * ux, f * (hu * uy + hv * vy)
-        f *= 0.5 * f
-        gxx, gxy = f * ux * ux * huu, f * ux * (uy * huu + vy * huv)
-        gyy = f * (uy * uy * huu + 2 * uy * vy * huv + vy * vy * hvv)
+        ff = splat(2 / LOG2E**2)
+        gxx, gxy = ff * ux * ux * huu, ff * ux * (uy * huu + vy * huv)
+        gyy = ff * (uy * uy * huu + two * uy * vy * huv + vy * vy * hvv)
         # Σ₂ = M Σ Mᵀ: dL/dΣ = Mᵀ G M, dL/dM = 2 G M Σ, dL/dJ = dL/dM Wᵀ
-        for i in range(3):
-            a, b = gxx * m[i] + gxy * k[i], gxy * m[i] + gyy * k[i]
-            for j in range(3):
-                g_cov[n, i, j] += a * m[j] + b * k[j]
-        a = (2 * (gxx * ms[0] + gxy * ks[0]), 2 * (gxx * ms[1] + gxy * ks[1]), 2 * (gxx * ms[2] + gxy * ks[2]))
-        b = (2 * (gxy * ms[0] + gyy * ks[0]), 2 * (gxy * ms[1] + gyy * ks[1]), 2 * (gxy * ms[2] + gyy * ks[2]))
+        a = (gxx * m[0] + gxy * k[0], gxx * m[1] + gxy * k[1], gxx * m[2] + gxy * k[2])
+        b = (gxy * m[0] + gyy * k[0], gxy * m[1] + gyy * k[1], gxy * m[2] + gyy * k[2])
+        _store_shape(lanes, shape, rotation, here, a, b, m, k)
+        a = (two * (gxx * ms[0] + gxy * ks[0]), two * (gxx * ms[1] + gxy * ks[1]), two * (gxx * ms[2] + gxy * ks[2]))
+        b = (two * (gxy * ms[0] + gyy * ks[0]), two * (gxy * ms[1] + gyy * ks[1]), two * (gxy * ms[2] + gyy * ks[2]))
         j00, j02, j11, j12 = _dot(a, ax), _dot(a, az), _dot(b, ay), _dot(b, az)
-        rz = 1 / p[2]
+        rz = one / p[2]
         jx, jy = fx * rz, fy * rz
         gx, gy = jx * gmx, jy * gmy
         gz = rz * (jx * (j02 * sx - j00) + jy * (j12 * sy - j11) - gx * p[0] - gy * p[1])
-        if sx == p[0] * rz:  # the slope was not clamped
-            gx -= jx * rz * j02
-            gz += jx * rz * sx * j02
-        if sy == p[1] * rz:
-            gy -= jy * rz * j12
-            gz += jy * rz * sy * j12
-        along = 0.0
+        x_free, y_free = sx == p[0] * rz, sy == p[1] * rz  # the slope was not clamped
+        bx, by = select(x_free, jx * rz * j02, zero), select(y_free, jy * rz * j12, zero)
+        gx, gy, gz = gx - bx, gy - by, gz + bx * sx + by * sy
+        g = (
+            ax[0] * gx + ay[0] * gy + az[0] * gz,
+            ax[1] * gx + ay[1] * gy + az[1] * gz,
+            ax[2] * gx + ay[2] * gy + az[2] * gz,
+        )
+        along = zero
         for i in range(3):
-            g = ax[i] * gx + ay[i] * gy + az[i] * gz
-            g_xyz[n, i] += g
-            g_velocity[n, i] += g * dt
-            along += g * velocity[n, i]
-        s = np.float64(sigma_t[n])
-        g_opacity[n] += h / opacity[n]
-        g_t[n] += h * dt / (s * s) - along
-        g_sigma[n] += h * dt * dt / (s * s * s)
+            store(lanes, i * 8, g[i])
+            store(lanes, (3 + i) * 8, g[i] * dt)
+            along = along + g[i] * gather(velocity, here, 0, 3, i)
+        s = gather(sigma_t, here, 0, 1, 0)
+        late = h * dt / (s * s)
+        store(lanes, 6 * 8, late - along)
+        store(lanes, 7 * 8, late * dt / s)
+        store(lanes, 8 * 8, h / gather(opacity, here, 0, 1, 0))
+        for i in range(3):
+            _add(g_xyz, lanes, i, here, 3, i, count)
+            _add(g_velocity, lanes, 3 + i, here, 3, i, count)
+            _add(g_rgb, S, i, here, 3, i, count)
+        _add(g_t, lanes, 6, here, 1, 0, count)
+        _add(g_sigma, lanes, 7, here, 1, 0, count)
+        _add(g_opacity, lanes, 8, here, 1, 0, count)
+        _add_shape(g_shape, g_rotation, lanes, here, count)
