@@ -8,6 +8,7 @@ import shlex
 import time
 from collections.abc import Callable
 from datetime import date
+from importlib.util import find_spec
 from pathlib import Path
 
 from tqdm import tqdm
@@ -28,7 +29,11 @@ def command_line(args: argparse.Namespace) -> str:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises InputError for options that cannot be."""
+    """Raises InputError for options that cannot be, and for what is not installed, before anything runs."""
+    if not find_spec("matplotlib"):
+        raise InputError("matplotlib is not installed; pip install 'timesplat[figures]'.")
+    if args.renderer and not find_spec("bpy"):
+        raise InputError("bpy is not installed; pip install 'timesplat[render]'.")
     for k in ("objects", "jobs"):
         if getattr(args, k) is not None and getattr(args, k) < 1:
             raise InputError(f"--{k} {getattr(args, k)}: give 1 or more.")
@@ -40,10 +45,10 @@ def check(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace, render_into: Callable) -> int:
     """The command; `render_into` as in cli. -> 2 where an object could not be rendered, else 0."""
+    check(args)
     if args.draw:
         print(charts.draw(args.draw))
         return 0
-    check(args)
     started = time.time()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.renderer:
@@ -93,8 +98,8 @@ def measure(args: argparse.Namespace, render_into: Callable, started: float) -> 
 
 
 def samples(path: Path, jobs: int) -> None:
-    """bench-renderer.csv, if there is none yet: as many objects at a time as `jobs`, one core each."""
-    if path.is_file():
+    """bench-renderer.csv, if there is none yet, and Blender: as many objects at a time as `jobs`, one core each."""
+    if path.is_file() or not find_spec("bpy"):
         return
     rows: list[dict] = []
     with tqdm(total=len(renderer.OBJECTS), desc="renderer", unit="object", disable=None) as bar:
