@@ -125,6 +125,9 @@ def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--method", default="guided", help="lift, guided, rgb, sweep, predicted, 4dgs (default: guided)")
     p.add_argument("--seconds", type=float, default=10.0, help="for methods that fit the scene: 4dgs (default: 10)")
     p.add_argument("--refine", type=float, default=0.0, help="seconds of fitting the result to the views (default: 0)")
+    p.add_argument("--budget", help="most Gaussians: a number, a share of those predicted such as 10%%, or auto: as "
+                   "many as the scene needs; fits them for --refine seconds, or 5")  # fmt: skip
+    p.add_argument("--max-loss", type=float, default=0.1, help="dB that --budget auto may lose (default: 0.1)")
     p.add_argument("--rig", help="use only the views of this rig")
     p.add_argument("--checkpoint", type=Path, help="weights in place of the shipped ones")
     p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
@@ -136,18 +139,31 @@ def reconstruct(args: argparse.Namespace) -> int:
 
     from .datagen.sequence import read_sequence
     from .model.asset import write_ply
+    from .model.budget import parse
     from .model.reconstruct import clip_of
     from .model.reconstruct import reconstruct as run
     from .model.refine import check_seconds
 
     start = time.perf_counter()
     check_seconds(args.refine)
+    if args.budget:
+        parse(args.budget)
     seq = read_sequence(args.sequence)
     rigs = sorted({v.rig for v in seq.views})
     if args.rig and args.rig not in rigs:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else [i for i, v in enumerate(seq.views) if v.rig != "target"]
-    g = run(seq, args.method, indices, args.device, args.checkpoint, seconds=args.seconds, refine=args.refine)
+    g = run(
+        seq,
+        args.method,
+        indices,
+        args.device,
+        args.checkpoint,
+        seconds=args.seconds,
+        refine=args.refine,
+        budget=args.budget,
+        max_loss=args.max_loss,
+    )
     write_ply(args.out, g.to_asset(clip_of(seq)))
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {time.perf_counter() - start:.1f} s")
     return 0

@@ -26,6 +26,7 @@ from .views import Views, pad_to_multiple
 BETAS, EPSILON = (0.9, 0.99), 1e-10  # Adam's; a shorter memory than usual, for hundreds of steps
 MASK = 0.3  # weight of the error in alpha against that in colour
 COARSE, COARSE_UNTIL = 160, 0.6  # longest side in pixels of what is drawn in this first part of the budget
+OWN = (0.2, 0.8)  # share of a step's views that are photographs, at the start and at the end, where there are others
 
 
 class Parameters:
@@ -79,6 +80,20 @@ class Parameters:
                 m[rows] = 0
 
 
+class Turns:
+    """Numbers first..last-1, all in turn, in a new random order each time."""
+
+    def __init__(self, first: int, last: int, generator: torch.Generator):
+        self.first, self.last, self.generator, self.order = first, last, generator, []
+
+    def take(self, n: int) -> list[int]:
+        while len(self.order) < n:
+            order = torch.randperm(self.last - self.first, generator=self.generator)
+            self.order += [self.first + i for i in order.tolist()]
+        taken, self.order = self.order[:n], self.order[n:]
+        return taken
+
+
 @dataclass
 class Step:
     """What a loss sees of a step."""
@@ -102,6 +117,12 @@ def own(views: Views, device="cpu") -> Views:
     """The views' colour, alpha, cameras and times copied to a device: free of inference mode."""
     names = ("rgb", "alpha", "c2w", "intrinsics", "time")
     return replace(views, depth=None, flow=None, **{k: getattr(views, k).to(device).clone() for k in names})
+
+
+def joined(a: Views, b: Views) -> Views:
+    """The views of `a`, then those of `b`, of the same size; as from `own`."""
+    names = ("rgb", "alpha", "c2w", "intrinsics", "time")
+    return replace(a, **{k: torch.cat([getattr(a, k), getattr(b, k)]) for k in names})
 
 
 def photographs(step: Step) -> Tensor:
@@ -133,6 +154,7 @@ def optimise(
     seconds: float,
     *,
     steps: int | None = None,
+    beside: Views | None = None,
     batch: int = 2,
     coarse: int = COARSE,
     edit: Callable[[int, float], None] | None = None,
@@ -146,12 +168,15 @@ def optimise(
 
     A step draws `scene()` from `batch` views (all views in turn, in random order) over `background` (3,) or
     a random colour, pictures larger than `coarse` pixels averaged down at first, and descends on `loss(step)`.
+    Views `beside`, where given, make up the rest of a step's share OWN of `views`.
     `edit(number, fraction)` may change the parameters' rows after a step, while their gradients are still there.
     `progress(fraction, text)` is called about ten times a second; without it a bar shows on a terminal after
     two seconds. Call inside of `gradients()`, with views from `own`."""
     generator = torch.Generator().manual_seed(seed)
+    count = len(views)
+    views = joined(views, beside) if beside else views
     small = shrunk(views, -(-max(views.size) // coarse))
-    order: list[int] = []
+    turns = Turns(0, count, generator), Turns(count, len(views), generator)
     start, told, done = clock(), 0.0, 0
     bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
     while True:
@@ -165,11 +190,10 @@ def optimise(
                 progress(fraction, f"{text}, step {done}")
         if fraction >= 1:
             break
-        while len(order) < batch:
-            order += torch.randperm(len(views), generator=generator).tolist()
-        now = small if fraction < COARSE_UNTIL else views
-        seen, order = now[order[:batch]], order[batch:]
-        height, width = now.size
+        share = OWN[0] + (OWN[1] - OWN[0]) * fraction
+        mine = int((torch.rand(batch, generator=generator) < share).sum()) if beside else batch
+        seen = (small if fraction < COARSE_UNTIL else views)[turns[0].take(mine) + turns[1].take(batch - mine)]
+        height, width = seen.size
         behind = torch.rand(3, generator=generator).to(views.rgb) if background is None else background
         here = scene()
         rgb, alpha = render(here, seen.c2w, seen.intrinsics, seen.time, width, height, background=behind)

@@ -50,11 +50,13 @@ def reconstruct(
     seconds: float = 10.0,
     refine: float = 0.0,
     budget: str | None = None,
+    max_loss: float = 0.1,
 ) -> Gaussians4D | Moving:
     """Views `indices` of the Sequence (all of them by default) -> the scene, Gaussians filtered out that the
     paper's inference filters would never draw. `progress(fraction, text)` is called between steps; `seconds`
     is what methods that fit a scene may take, `refine` the seconds for which the result is then fitted to the
-    views (`refine.py`).
+    views (`refine.py`), `budget` how many Gaussians it may have: "N", "P%" or "auto", which keeps within `max_loss`
+    dB (`budget.py`).
 
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint."""
     report = progress or (lambda fraction, text: None)
@@ -68,7 +70,7 @@ def reconstruct(
     report(0.3, f"reconstructing ({method})")
     with torch.inference_mode():
         fit = progress and (lambda fraction, text: report(0.3 + 0.7 * fraction, text))
-        g = reconstruct_views(views, method, device, checkpoint, seconds, fit, refine, budget)
+        g = reconstruct_views(views, method, device, checkpoint, seconds, fit, refine, budget, max_loss)
     return g[g.alive()]
 
 
@@ -81,17 +83,21 @@ def reconstruct_views(
     progress=None,
     refine: float = 0.0,
     budget: str | None = None,
+    max_loss: float = 0.1,
     dense: bool = False,
 ) -> Gaussians4D | Moving:
     """The same from tensors; unfiltered. `seconds` is for methods that fit a scene, `progress` for what takes
     seconds; `dense`: tokens of a network everywhere, and not only where the object is."""
-    if refine:
+    if refine or budget:
+        from .budget import reduced
         from .refine import check_seconds
         from .refine import refine as fit
 
         check_seconds(refine)
-        start = reconstruct_views(views, method, device, checkpoint, seconds, dense=dense)
-        return fit(start, views, refine, device, near=method in NEEDS_PASSES, progress=progress)
+        start, near = reconstruct_views(views, method, device, checkpoint, seconds, dense=dense), method in NEEDS_PASSES
+        if budget:
+            return reduced(start, views, budget, refine, near=near, max_loss=max_loss, device=device, progress=progress)
+        return fit(start, views, refine, device, near=near, progress=progress)
     if method in ("white", "hull"):
         from .baselines import hull
 

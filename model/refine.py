@@ -3,38 +3,52 @@
 
 One view a moment says little about a scene, and is soon learnt by heart (33 dB on the inputs where other views
 gain nothing any more). What keeps it from that:
-    a prediction from RGB is merged into few, larger, longer-lived Gaussians first, which several views see each
-    (and steps are several times faster); one from depth and motion is kept as it is, and left only a little;
+    few, larger, longer-lived Gaussians, fused from those predicted: several views see each, and steps are quick;
+    a prediction from depth and motion is drawn from all around first, and the few are fitted to these pictures as
+    well as to the photographs, more and more to the latter;
     a price on opacity, random backgrounds, and small pictures at first;
-    of the start and some states on the way, the best on a few input views is returned.
-These are fitted like the others, so that they tell where a fit goes wrong, not where it begins to overfit. Held
-out, they said "stay" of an object that gained 3.5 dB elsewhere, even after merging: the start is made of them.
+    of some states on the way, the best on a few input views is taken, and the start where none is better.
+These views are fitted like the others, so that they tell where a fit goes wrong, not where it begins to overfit.
+Held out, they said "stay" of an object that gained 3.5 dB elsewhere, even after fusing: the start is made of them.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ..datagen.sequence import InputError
+from ..datagen.rigs import spherical
+from ..datagen.sequence import InputError, opengl_to_opencv
 from .baselines.four_dgs import EVERY, RATES, UNTIL, activate, densify
-from .gaussians import Gaussians4D, Moving, scale_rotation_from_covariance
+from .fuse import fuse
+from .gaussians import Gaussians4D, Moving
 from .optimise import Parameters, Step, gradients, optimise, own, photographs
 from .rasterize import render
 from .views import Views
 
-# A prediction from RGB. Means over four development objects of held-out PSNR after 10 CPU-seconds:
-COUNT, MOST = 2000, 3000  # Gaussians after merging, and after splitting where the fit pulls: see `refine`
-MOMENTS = 6  # parts of the clip within which Gaussians are merged
-LIFE = 0.25  # least σ_t, an eighth of the clip: several views of one a frame
-FADE = 0.3  # of opacity at the start: what hides the rest must not be there before it is known to be right
 COARSE = 64  # longest side in pixels of the pictures at first: 0.1 dB and a fifth more steps
-PRICE = 0.1  # of mean opacity, in the loss, times the share of the pictures that the object covers: 0.2 dB over 0.04
-# Learning rates at the start and at the end, of the raw parameters, where depth and motion are known: places are
-# right to a pixel, and some 80 steps are all there is time for. (Four times the rate of opacity, with the price, won a
-# little more on clouds of 75,000, and lost on larger ones, which take fewer steps.) From RGB: those of four_dgs.
+JUDGES = 4  # input views that judge
+LOOKS = 6  # states on the way that are judged, the last one included
+FUSED = 2 / 3  # of the Gaussians wanted are fused from those predicted; the others are split off where the fit pulls
+
+# A prediction from RGB:
+FEW, PRICE = 3000, 0.1  # Gaussians; price of mean opacity in the loss, times the share of the pictures that is object
+LIFE = 0.25  # least σ_t at the start, an eighth of the clip: several views of one a frame
+FADE = 0.3  # of opacity at the start: what hides the rest must not be there before it is known to be right
+
+# A prediction from depth and motion:
+NEAR_FEW, NEAR_PRICE = 4000, 0.02
+ALL = 4.0  # seconds up to which its Gaussians are all kept, and moved only a little: some 80 steps
+FIRST, LONGEST = 0.3, 3.0  # of more seconds this share, and so many at most, come before they are fused
+AROUND = 96  # pictures of them from other sides
+STEEPEST = 58  # degrees of elevation, up and down, of where these are taken
+# Learning rates at the start and at the end, of the raw parameters, while all are kept: places are right to a pixel.
+# (Four times the rate of opacity, with a price, won a little more on clouds of 75,000, and lost on larger ones, which
+# take fewer steps.) Of the few: those of four_dgs.
 NEAR = {
     "xyz": (2e-4, 2e-4),
     "t": (0.0, 0.0),
@@ -45,8 +59,6 @@ NEAR = {
     "rgb": (2e-3, 1e-3),
     "opacity": (3e-2, 1e-2),
 }
-JUDGES = 4  # input views that judge
-LOOKS = 6  # states on the way that are judged, the last one included
 
 
 def check_seconds(seconds: float) -> None:
@@ -62,17 +74,15 @@ def refine(
     device: str = "cpu",
     *,
     near: bool = False,
+    count: int | None = None,
     steps: int | None = None,
     seed: int = 0,
     progress=None,
 ) -> Gaussians4D:
     """Gaussians and the input views that they are of -> refined Gaussians on the CPU, after `seconds` or exactly
-    `steps`; `start` itself for zero seconds, or where the views that judge fit no better. `near`: the
-    start knows depth and motion, so stay near it. For `progress` see `optimise`.
-
-    Few Gaussians see more views each and make quick steps: over four objects, after 4 CPU-seconds, merging to
-    2000 and splitting to 3000 gave 29.4 dB on held-out views; 3000 without splitting 29.2, 6000 split to 12000
-    28.8, 4DGS from random points in the same seconds in all 29.0, the start 26.3.
+    `steps`; `start` itself for zero seconds, or where the views that judge fit no better. `near`: the start knows
+    depth and motion. count: most Gaussians, 1 or more; with it the result is of no more, even if it is worse.
+    For `progress` see `optimise`.
 
     Raises InputError for a scene that is not of 4D Gaussians and for a wrong number of seconds."""
     check_seconds(seconds)
@@ -86,50 +96,101 @@ def refine(
         if not len(g):
             return start
         views = own(views, device)
-        judges = views[judging(views)]
-        g = g if near else merge(g, COUNT, MOMENTS)
-        best, kept = error(g, judges), None
-        p = Parameters(raw(g) if near else raw(g, LIFE, FADE), NEAR if near else RATES)
-        cover, looked = views.alpha.mean(), 0
-        pull, generator = torch.zeros_like(p["t"].detach()), torch.Generator().manual_seed(seed)
+        least, better, first = error(g, views[judging(views)]), None, 0.0
+        fusing = not near or count is not None or seconds > ALL
+        if near:
+            first = min(FIRST, LONGEST / seconds if seconds else 1.0) if fusing else 1.0  # share of the budget
+            whole = None if steps is None else round(first * steps)
+            e, moved = fit(
+                raw(g), NEAR, views, first * seconds, steps=whole, seed=seed, progress=part(progress, 0, first)
+            )
+            if e < least:
+                g = better = moved
+        if fusing:
+            most = count or (NEAR_FEW if near else FEW)
+            few = fuse(g, max(int(FUSED * most), 1))
+            values = raw(few) if near else raw(few, LIFE, FADE)
+            e, fitted = fit(
+                values,
+                RATES,
+                views,
+                (1 - first) * seconds,
+                beside=around(g, views, seed) if near else None,
+                most=most,
+                price=NEAR_PRICE if near else PRICE,
+                coarse=COARSE,
+                steps=None if steps is None else steps - round(first * steps),
+                seed=seed,
+                progress=part(progress, first, 1),
+            )
+            if e < least or count is not None:
+                better = fitted
+        return start if better is None else better.to("cpu")
 
-        def loss(step: Step) -> Tensor:
-            return photographs(step) + (0.0 if near else PRICE) * cover * step.scene.opacity.mean()
 
-        def look() -> None:
-            nonlocal best, kept
-            with torch.no_grad():
-                now = activate(p.values)
-                e = error(now, judges)
-                if e < best:
-                    best, kept = e, now.map(torch.clone)
+def part(progress, first: float, last: float):
+    """The callback `progress(fraction, text)` (or None) of a part of what it reports, from `first` to `last`."""
+    return progress and (lambda fraction, text: progress(first + (last - first) * fraction, text))
 
-        def edit(number: int, fraction: float) -> None:
-            nonlocal looked, pull
-            if not near:
-                pull += p["xyz"].grad.norm(dim=-1)
-                if number % EVERY == 0 and fraction < UNTIL:
-                    densify(p, pull, generator, MOST)
-                    pull = torch.zeros_like(p["t"].detach())
-            if fraction * LOOKS >= looked + 1:
-                looked += 1
-                look()
 
-        optimise(
-            p,
-            lambda: activate(p.values),
-            views,
-            loss,
-            seconds,
-            steps=steps,
-            coarse=max(views.size) if near else COARSE,
-            edit=edit,
-            seed=seed,
-            text="refining",
-            progress=progress,
-        )
-        look()
-        return start if kept is None else kept.to("cpu")
+def fit(
+    values: dict[str, Tensor],
+    rates: dict[str, tuple[float, float]],
+    views: Views,
+    seconds: float,
+    *,
+    beside: Views | None = None,
+    most: int | None = None,
+    price: float = 0.0,
+    coarse: int | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    progress=None,
+) -> tuple[float, Gaussians4D]:
+    """Raw parameters fitted to views (and those `beside`) by `optimise` -> the best state's error on the views that
+    judge, and that state. most: Gaussians are split up to this number; None: they stay as many as they are."""
+    judges, cover = views[judging(views)], views.alpha.mean()
+    p, generator = Parameters(values, rates), torch.Generator().manual_seed(seed)
+    best, kept, looked, pull = math.inf, None, 0, torch.zeros_like(p["t"].detach())
+
+    def loss(step: Step) -> Tensor:
+        return photographs(step) + (price * cover * step.scene.opacity.mean() if price else 0.0)
+
+    def look() -> None:
+        nonlocal best, kept
+        with torch.no_grad():
+            now = activate(p.values)
+            e = error(now, judges)
+            if e < best or kept is None:
+                best, kept = e, now.map(torch.clone)
+
+    def edit(number: int, fraction: float) -> None:
+        nonlocal looked, pull
+        if most:
+            pull += p["xyz"].grad.norm(dim=-1)
+            if number % EVERY == 0 and fraction < UNTIL:
+                densify(p, pull, generator, most)
+                pull = torch.zeros_like(p["t"].detach())
+        if fraction * LOOKS >= looked + 1:
+            looked += 1
+            look()
+
+    optimise(
+        p,
+        lambda: activate(p.values),
+        views,
+        loss,
+        seconds,
+        beside=beside,
+        steps=steps,
+        coarse=coarse or max(views.size),
+        edit=edit,
+        seed=seed,
+        text="refining",
+        progress=progress,
+    )
+    look()
+    return best, kept
 
 
 def judging(views: Views) -> Tensor:
@@ -161,38 +222,19 @@ def raw(g: Gaussians4D, life: float = 1e-6, fade: float = 1.0) -> dict[str, Tens
 
 
 @torch.no_grad()
-def merge(g: Gaussians4D, count: int, moments: int) -> Gaussians4D:
-    """About `count` Gaussians (or all, if they are no more) with the moments of those merged into them: those
-    whose centres share a cell of a grid in space at the middle of one of `moments` parts of the clip."""
-    if len(g) <= count:
-        return g
-    part = ((g.t.clamp(-1, 1) + 1) / 2 * moments).floor().clamp_max(moments - 1)
-    place = g.position((part + 0.5) / moments * 2 - 1)
-    small, large = 1e-3, 1.0
-    for _ in range(16):  # bisection for the cell's side
-        side = (small * large) ** 0.5
-        cell = torch.cat([(place / side).floor(), part[:, None]], -1).long().clamp(-(2**14), 2**14 - 1) + 2**14
-        key = ((cell[:, 0] * 2**15 + cell[:, 1]) * 2**15 + cell[:, 2]) * 2**15 + cell[:, 3] - 2**14
-        _, owner = key.unique(return_inverse=True)
-        n = int(owner.max()) + 1
-        small, large = (side, large) if n > count else (small, side)
-    weight = g.opacity * _area(g.scale) * g.sigma_t + 1e-12  # how much is seen of it, and how long
-    total = weight.new_zeros(n).index_add(0, owner, weight)
-
-    def mean(x: Tensor) -> Tensor:
-        w = weight.view(-1, *[1] * (x.ndim - 1))
-        return x.new_zeros(n, *x.shape[1:]).index_add(0, owner, x * w) / total.view(-1, *[1] * (x.ndim - 1))
-
-    t, velocity = mean(g.t), mean(g.velocity)
-    centre = g.position(t[owner])
-    xyz = mean(centre)
-    off = centre - xyz[owner]
-    scale, rotation = scale_rotation_from_covariance(mean(g.covariance3() + off[:, :, None] * off[:, None]))
-    sigma_t = mean(g.sigma_t.square() + (g.t - t[owner]).square()).sqrt()
-    opacity = (total / (_area(scale) * sigma_t)).clamp(0.05, 0.9)
-    return Gaussians4D(xyz, t, velocity, sigma_t, scale, rotation, mean(g.rgb), opacity)
-
-
-def _area(scale: Tensor) -> Tensor:
-    """(N,3) -> (N,) about what a Gaussian covers: the product of its two longer axes."""
-    return scale.prod(-1) / scale.amin(-1)
+def around(g: Gaussians4D, views: Views, seed: int = 0, count: int = AROUND) -> Views:
+    """`count` pictures of the Gaussians from random sides at the moments of the views, taken as those are: from
+    their median distance to the origin, with the median of their intrinsics."""
+    rng = np.random.default_rng([seed, 11])
+    distance = float(views.c2w[:, :3, 3].norm(dim=-1).median())
+    steepest = math.sin(math.radians(STEEPEST))
+    elevations = np.degrees(np.arcsin(rng.uniform(-steepest, steepest, count)))
+    poses = [spherical(a, e, distance) for a, e in zip(rng.uniform(0, 360, count), elevations, strict=True)]
+    c2w = torch.from_numpy(opengl_to_opencv(np.stack(poses))).to(views.c2w)
+    intrinsics = views.intrinsics.median(0).values.expand(count, 4).clone()
+    moments = views.time.unique()
+    time = moments[torch.from_numpy(rng.integers(len(moments), size=count)).to(moments.device)]
+    height, width = views.size
+    rgb, alpha = render(g, c2w, intrinsics, time, width, height, background=0.0, inference=True)
+    rgb = rgb / alpha.clamp_min(1e-4)[..., None]  # straight
+    return replace(views, rgb=rgb, alpha=alpha, c2w=c2w, intrinsics=intrinsics, time=time)

@@ -95,7 +95,15 @@ def test_smaller_sizes_are_averages(sphere_folder):
 
 def test_method_specs():
     assert parse_method(" lift").passes and not parse_method("sweep").passes
-    for spec, says in (("magic", "no such method"), ("lift+fast", "not an option"), ("lift+budget:x", "not an option")):
+    both = parse_method("guided+refine:10+budget:10%+dense")
+    assert (both.name, both.refine, both.budget, both.dense) == ("guided", 10.0, "10%", True)
+    assert parse_method("lift+budget:auto").budget == "auto" and parse_method("lift+budget:500").refine is None
+    for spec, says in (
+        ("magic", "no such method"),
+        ("lift+fast", "in this order"),
+        ("lift+budget:x", "lift..refine:SECONDS"),
+        ("lift+budget:5+refine:1", "in this order"),
+    ):
         with pytest.raises(InputError, match=says):
             parse_method(spec)
 
@@ -160,7 +168,7 @@ def test_bad_options_are_refused_before_anything_runs(folders, tmp_path, capsys)
         (["--setup", "sideways"], "sideways: no such setup"),
         (["--size", "12x"], "--size 12x: give numbers"),
         (["--size", "16,32", "--stride", "1,2,3"], "for each of the 2 sizes"),
-        (["--methods", "lift+magic:3"], "magic:3 is not an option"),
+        (["--methods", "lift+magic:3"], "lift+magic:3: write lift"),
         (["--jobs", "0"], "--jobs 0"),
         (["--seconds", "0"], "--seconds 0"),
     ):

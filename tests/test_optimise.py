@@ -60,7 +60,7 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
             def scene():
                 turn = torch.tensor([[1.0, 0, 0, 0]])
                 return Gaussians4D(
-                    0 * p["rgb"], 0 * one, 0 * p["rgb"], 1e6 * one, one[:, None] * 3, turn, p["rgb"], one
+                    0 * p["rgb"], 0 * one, 0 * p["rgb"], 1e6 * one, torch.full((1, 3), 3.0), turn, p["rgb"], one
                 )
 
             drawn = []

@@ -13,7 +13,7 @@ from timesplat.model.evaluate import evaluate_method, parse_method
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.lift import lift
 from timesplat.model.reconstruct import reconstruct_views
-from timesplat.model.refine import JUDGES, error, judging, merge, refine
+from timesplat.model.refine import JUDGES, around, error, judging, part, refine
 
 
 @pytest.fixture(scope="module")
@@ -63,19 +63,27 @@ def test_views_that_judge_are_spread_over_the_clip(scene):
     assert isinstance(refine(lift(inputs[:3]), inputs[:3], 0, steps=3), Gaussians4D)
 
 
-def test_merging_keeps_moments(scene):
+def test_pictures_from_around_are_what_the_gaussians_look_like(scene):
     inputs, _ = scene
     g = lift(inputs)
-    few = merge(g, 500, 6)
-    assert 350 < len(few) < 650 and merge(g, len(g), 6) is g
-    assert error(few, inputs) < 0.02
-    one = merge(g, 1, 1)
-    assert len(one) < 20
-    pair = g[[0, 0]]
-    same = merge(pair, 1, 1)
-    torch.testing.assert_close(same.covariance3(), pair.covariance3()[:1], atol=1e-7, rtol=1e-3)
-    for k in ("xyz", "t", "velocity", "sigma_t", "rgb"):
-        torch.testing.assert_close(getattr(same, k), getattr(pair, k)[:1], atol=1e-5, rtol=1e-4)
+    views = around(g, inputs, seed=3, count=5)
+    assert len(views) == 5 and views.size == inputs.size and set(views.time.tolist()) <= set(inputs.time.tolist())
+    assert error(g, views) < 1e-6  # over white, as they were drawn
+    torch.testing.assert_close(views.c2w[:, :3, 3].norm(dim=-1), inputs.c2w[:5, :3, 3].norm(dim=-1))
+    torch.testing.assert_close(torch.linalg.det(views.c2w[:, :3, :3]), torch.ones(5))
+    torch.testing.assert_close(around(g, inputs, seed=3, count=5).rgb, views.rgb)
+    assert (around(g, inputs, seed=4, count=5).c2w - views.c2w).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_a_count_is_kept_even_where_the_start_was_better(scene, near):
+    inputs, others = scene
+    start = lift(inputs)
+    told = []
+    g = refine(start, inputs, 0, near=near, steps=60, count=200, progress=lambda f, text: told.append(f))
+    assert len(g) <= 200 < len(start) / 5 and error(g, others) < 0.01
+    assert told == sorted(told) and told[-1] == 1
+    assert part(None, 0, 1) is None
 
 
 def test_refusals(scene):
