@@ -24,8 +24,9 @@ STRETCH = 2.5  # a slanted pixel's footprint grows at most by this
 THICKNESS = 0.15  # σ along the normal, in pixels
 INSET = 1.0  # how far below the surface a Gaussian sits, in pixels: its own width reaches back out to it
 OPACITY = 0.95
-LIFE = 0.5  # σ_t as a multiple of half a piece's length
-SHORTEST = 0.45  # least σ_t, in frames: less would flicker between frames
+LIFE = 0.6  # σ_t as a multiple of half a piece's length
+SHORTEST = 0.45  # least σ_t, in frames, where a network goes on from there: less, and it cannot close the gaps
+ALONE = 0.3  # the same without a network
 FEATURES = 12  # extra input channels that a Geometry carries
 
 
@@ -44,11 +45,12 @@ class Geometry:
 
 def lift(views: Views) -> Gaussians4D:
     """Views with depth and flow -> (M,) Gaussians."""
-    return lift_geometry(views).gaussians
+    return lift_geometry(views, ALONE).gaussians
 
 
-def lift_geometry(views: Views) -> Geometry:
-    """Views with depth and flow -> Geometry. CPU tensors (the kernel that follows points is compiled)."""
+def lift_geometry(views: Views, shortest: float = SHORTEST) -> Geometry:
+    """Views with depth and flow, least σ_t in frames -> Geometry. CPU tensors (the kernel that follows points is
+    compiled)."""
     step = views.frame_step
     depth = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
     valid = (views.alpha > 0.35) & (depth > 0)
@@ -74,7 +76,7 @@ def lift_geometry(views: Views) -> Geometry:
         xyz=place - INSET * (pixel[:, None] * points.normal)[owner],
         t=middle * step,
         velocity=velocity / step,
-        sigma_t=(LIFE * half).clamp_min(SHORTEST) * step,
+        sigma_t=(LIFE * half).clamp_min(shortest) * step,
         scale=scale[owner],
         rotation=quaternion(axes)[owner],
         rgb=views.rgb[valid][owner],

@@ -22,6 +22,7 @@ import threading
 import time
 import traceback
 from pathlib import Path
+from types import ModuleType
 from typing import TextIO
 
 from ..datagen.sequence import InputError, read_sequence
@@ -62,6 +63,9 @@ def _reconstruct(request: dict, progress) -> int:
     progress(0.0, "starting")
     sequence = read_sequence(Path(request["sequence"]))
     from .asset import write_ply
+
+    # A third of torch's start-up: what shapes its operations return, for compilers, which are not used here.
+    sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
     from .reconstruct import clip_of, reconstruct  # imports torch
 
     checkpoint = request.get("checkpoint")

@@ -105,6 +105,28 @@ def test_what_libraries_print_does_not_reach_the_protocol():
         assert words in err
 
 
+LISTING = """
+import json, sys
+from timesplat.model import worker
+code = worker.main([])
+loaded = [name for name, module in sys.modules.items() if getattr(module, "__file__", None)]
+print(json.dumps({"loaded": loaded}), file=sys.__stderr__)
+sys.exit(code)
+"""
+HEAVY = ["torch._meta_registrations", "torch._dynamo", "torch._inductor", "sympy", "networkx", "scipy", "matplotlib"]
+HEAVY += ["pandas", "bpy", "pxr", "pytest", "IPython", "timesplat.model.train", "timesplat.model.evaluate"]
+
+
+@pytest.mark.parametrize("method", ["guided", "rgb"])
+def test_nothing_heavy_is_imported_that_it_does_not_use(tmp_path, sequence, method):
+    request = {"sequence": str(sequence), "asset": str(tmp_path / "a.ply"), "method": method}
+    code, said, err = ask(stdin=json.dumps(request) + "\n", code=LISTING)
+    assert code == 0 and said[-1]["gaussians"] > 100
+    loaded = json.loads(err.splitlines()[-1])["loaded"]
+    assert "torch" in loaded and "numba" in loaded
+    assert [name for name in HEAVY if name in loaded] == []
+
+
 WAITING = """
 import sys, time
 from timesplat.model import worker
