@@ -7,18 +7,31 @@ and the small ones, unless `--all`; on CUDA, where there is one, bfloat16 and al
 FLOPs are counted exactly, two for a multiply-add: every linear layer over the tokens that pass through it, and
 the two products of attention, 4·T²·D a block. What is elementwise is not counted. The floor is that count at the
 speed of a large square matrix product, measured on the same machine in the same precision.
+
+On rendered objects (folders of Sequences with passes; the rig `alternating` is the input, `target` is held out) and
+with the shipped checkpoints, processor seconds of the network alone, on one thread:
+    --tokens FOLDER…      with and without the patches that show nothing, and what that does to the held-out views
+    --precision FOLDER…   float32, bfloat16 and 8-bit integers, and attention written out
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import time
+import warnings
+from pathlib import Path
 
 import torch
+from torch import nn
 
+from timesplat.datagen.sequence import read_sequence
+from timesplat.model.evaluate import draw
+from timesplat.model.metrics import psnr
 from timesplat.model.network import PRESETS, Network
-from timesplat.model.views import Views
+from timesplat.model.reconstruct import CHECKPOINTS, geometry_for, load_network
+from timesplat.model.views import Views, load_views
 
 CASES = [("tiny", 24, 64), ("tiny", 24, 128), ("small", 24, 128), ("base", 12, 128), ("base", 24, 256)]
 CASES += [("large", 12, 256), ("large", 24, 256), ("large", 48, 256)]
@@ -111,13 +124,89 @@ def row(name: str, views: Views, drop: bool, device: str, roof: float, seconds: 
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
+def objects(folders: list[Path]):
+    """Name, input Views and held-out Views of every Sequence below the folders."""
+    for file in sorted(f for folder in folders for f in folder.rglob("transforms.json")):
+        seq = read_sequence(file.parent)
+        inputs = load_views(seq, seq.select(rig="alternating"), passes=True)
+        yield file.parent.parent.name, inputs, load_views(seq, seq.select(rig="target"))
+
+
+def measure(run, targets: Views) -> tuple[float, float]:
+    """Least processor seconds of three calls of run() -> Gaussians; PSNR of the held-out views."""
+    least = math.inf
+    for _ in range(3):
+        start = time.process_time()
+        g = run()
+        least = min(least, time.process_time() - start)
+    return least, float(psnr(draw(g[g.alive()], targets)[0], targets.over()).mean())
+
+
+@torch.inference_mode()
+def tokens(folders: list[Path]) -> None:
+    """Prints a table of what dropping empty patches saves, and costs."""
+    print("| network | object | patches kept | s all | s kept | ratio | PSNR all | PSNR kept |\n" + "|---" * 8 + "|")
+    for name in ("guided", "sweep", "predicted"):
+        network, rows = load_network(CHECKPOINTS / f"{name}.safetensors"), []
+        for what, views, targets in objects(folders):
+            geometry = geometry_for(network.config.source, views)
+            slow, before = measure(lambda: network(views, geometry, False), targets)  # noqa: B023
+            fast, after = measure(lambda: network(views, geometry, True), targets)  # noqa: B023
+            rows.append((float(network.kept_patches(views).float().mean()), slow, fast, slow / fast, before, after))
+            print(line(name, what, rows[-1]), flush=True)
+        print(line(name, "median", torch.tensor(rows).median(0).values.tolist()))
+        print(line(name, "mean", torch.tensor(rows).mean(0).tolist()), flush=True)
+
+
+def line(name: str, what: str, row) -> str:
+    share, slow, fast, ratio, before, after = row
+    return f"| {name} | {what} | {share:.0%} | {slow:.3f} | {fast:.3f} | {ratio:.1f} | {before:.2f} | {after:.2f} |"
+
+
+@torch.inference_mode()
+def precision(folders: list[Path]) -> None:
+    """Prints a table of the ways to compute the same network."""
+    from torch.nn.attention import SDPBackend, sdpa_kernel
+
+    def eight_bits(network: Network) -> nn.Module:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch.ao is on its way out
+            return torch.ao.quantization.quantize_dynamic(network, {nn.Linear}, torch.qint8)
+
+    ways = {
+        "float32": (lambda n: n, contextlib.nullcontext),
+        "bfloat16": (lambda n: n, lambda: torch.autocast("cpu", torch.bfloat16)),
+        "8-bit integers": (eight_bits, contextlib.nullcontext),
+        "attention written out": (lambda n: n, lambda: sdpa_kernel(SDPBackend.MATH)),
+    }
+    print("| network | computed in | s, mean | PSNR, mean |\n|---|---|---|---|")
+    for name in ("guided", "sweep"):
+        network = load_network(CHECKPOINTS / f"{name}.safetensors")
+        scenes = [(v, geometry_for(network.config.source, v), t) for _, v, t in objects(folders)]
+        for way, (change, context) in ways.items():
+            changed, rows = change(network), []
+            for views, geometry, targets in scenes:
+                with context():
+                    rows.append(measure(lambda: changed(views, geometry), targets))  # noqa: B023
+            seconds, quality = torch.tensor(rows).mean(0).tolist()
+            print(f"| {name} | {way} | {seconds:.3f} | {quality:.2f} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--all", action="store_true", help="the large ones on the CPU as well: many minutes, 16 GB")
     parser.add_argument("--threads", type=int, default=1, help="on the CPU (default: 1)")
     parser.add_argument("--seconds", type=float, default=2, help="per figure")
+    parser.add_argument("--tokens", type=Path, nargs="+", metavar="FOLDER", help="dropping tokens, on these objects")
+    parser.add_argument("--precision", type=Path, nargs="+", metavar="FOLDER", help="number formats, on these objects")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    if args.tokens or args.precision:
+        if args.tokens:
+            tokens(args.tokens)
+        if args.precision:
+            precision(args.precision)
+        return
 
     head = ["on", "preset", "M weights", "views", "size", "empty patches", "tokens", "TFLOP"]
     head += ["s", "s in blocks", "TFLOP/s", "floor s", "share of peak", "GB"]
