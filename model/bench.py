@@ -32,6 +32,7 @@ from tqdm import tqdm
 from ..datagen.sequence import InputError, Sequence, read_sequence
 from . import protocol
 from .asset import write_ply
+from .budget import SECONDS
 from .coverage import coverage
 from .evaluate import Plan, append, draw, evaluate_views, key_of, load_inputs, load_truth, parse_method, read_rows
 from .evaluate import warm_up as warm_up_methods
@@ -49,7 +50,7 @@ CENTRE = ["lift", "guided", "rgb", "predicted", "gs-lrm-all", "gs-lrm-frame", "h
 CENTRE += ["guided+dense", "rgb+dense", "predicted+dense"]
 CENTRE += [f"{name}:{s}" for name in ("4dgs", "som") for s in FITS]
 CENTRE += [f"{name}+refine:{s}" for name in ("guided", "rgb") for s in FITS]
-CENTRE += [f"guided{fit}+budget:{n}" for fit in ("", "+refine:10") for n in BUDGETS]
+CENTRE += [f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in BUDGETS]
 AXES = ["lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3"]  # at other sizes and numbers of views
 COVERED = {"lift", "guided", "rgb", "sweep"}  # their Gaussians know which way their surface faces
 QUICK = 3.0  # seconds of fitting that a quick run has at the most
@@ -80,8 +81,9 @@ class Way:
 
     @property
     def fit(self) -> float:
-        """Seconds of fitting in all."""
-        return self.seconds + (parse_method(self.spec).refine or 0.0)
+        """Seconds of fitting in all, without what `auto` takes to find its number."""
+        wanted = parse_method(self.spec)
+        return self.seconds + (wanted.refine or (SECONDS if wanted.budget else 0.0))
 
     @property
     def checkpoint(self) -> Path | None:

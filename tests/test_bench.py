@@ -16,6 +16,7 @@ from timesplat.cli import main
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.model import bench
 from timesplat.model.bench import Point, parse
+from timesplat.model.budget import SECONDS
 from timesplat.model.pareto import frontier, read_csv, standard_error, summarise, write_csv
 
 COORDINATES = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
@@ -38,7 +39,9 @@ def test_frontier_is_what_brute_force_says(points):
 
 def test_labels():
     way = parse("4dgs:10+budget:10%")
-    assert (way.name, way.spec, way.seconds, way.fit, way.baseline) == ("4dgs", "4dgs+budget:10%", 10, 10, True)
+    assert (way.name, way.spec, way.seconds, way.baseline) == ("4dgs", "4dgs+budget:10%", 10, True)
+    assert way.fit == 10 + SECONDS
+    assert parse("guided+budget:5%").fit == SECONDS and parse("guided+refine:3+budget:5%").fit == 3
     way = parse("guided+refine:3")
     assert way.fit == 3 and way.passes and not way.baseline and way.checkpoint is None
     for label, says in (
