@@ -11,8 +11,10 @@ from __future__ import annotations
 import math
 import re
 
+import torch
+
 from ..datagen.sequence import InputError
-from .fuse import fuse
+from .fuse import contribution, fuse
 from .gaussians import Gaussians4D, Moving
 from .optimise import gradients, own
 from .refine import FADE, FUSED, LIFE, NEAR_PRICE, PRICE, RATES, around, error, fit, part, raw, refine
@@ -21,6 +23,7 @@ from .views import Views
 SECONDS = 5.0  # of fitting, where none are asked for
 FEWEST = 500  # Gaussians to try first; then twice as many, and so on
 TRIAL = 1.5  # seconds of each try
+LEAST = 1.0  # pixels that a Gaussian must contribute in all of AROUND pictures together: a twentieth do not
 HELD = 6  # input views that are held out
 
 
@@ -57,7 +60,10 @@ def reduced(
     elif isinstance(wanted, float):
         wanted = max(int(wanted * start.alive().sum()), 1) if isinstance(start, Gaussians4D) else 1
     told = part(progress, search, 1)
-    return refine(start, views, seconds or SECONDS, device, near=near, count=wanted, progress=told)
+    g = refine(start, views, seconds or SECONDS, device, near=near, count=wanted, progress=told)
+    with gradients():
+        g = g.map(torch.clone)
+        return g[contribution(g, around(g, own(views))) > LEAST] if len(g) else g
 
 
 def fewest(

@@ -28,6 +28,7 @@ from .fuse import fuse
 from .gaussians import Gaussians4D, Moving
 from .optimise import Parameters, Step, gradients, optimise, own, photographs
 from .rasterize import render
+from .threads import clock
 from .views import Views
 
 COARSE = 64  # longest side in pixels of the pictures at first: 0.1 dB and a fifth more steps
@@ -90,6 +91,7 @@ def refine(
         raise InputError("Refinement is of 4D Gaussians, and this method's scene is of another kind; leave it out.")
     if (seconds == 0 and not steps) or not len(start):
         return start
+    began = clock()
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g = g[g.alive()]
@@ -109,13 +111,14 @@ def refine(
         if fusing:
             most = count or (NEAR_FEW if near else FEW)
             few = fuse(g, max(int(FUSED * most), 1))
+            beside = around(g, views, seed) if near else None
             values = raw(few) if near else raw(few, LIFE, FADE)
             e, fitted = fit(
                 values,
                 RATES,
                 views,
-                (1 - first) * seconds,
-                beside=around(g, views, seed) if near else None,
+                max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
+                beside=beside,
                 most=most,
                 price=NEAR_PRICE if near else PRICE,
                 coarse=COARSE,
