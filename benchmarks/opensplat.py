@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The CPU rasteriser of OpenSplat, the fastest third-party one found, for `benchmarks/rasterize.py --opensplat DIR`.
 
-DIR is a checkout of https://github.com/pierotofy/OpenSplat (now WebODM/OpenSplat; AGPL; nothing of it is copied here). Its two CPU functions
-of rasterizer/gsplat-cpu are compiled as they are, with -O3 -march=native; its projection has torch's own gradients,
-its blending a backward function of its own. Versions of the checkout differ in what more that one takes (maps for
-densification, left out: then it does not compute them).
+DIR is a checkout of https://github.com/pierotofy/OpenSplat (now WebODM/OpenSplat; AGPL; nothing of it is copied here).
+Its two CPU functions of rasterizer/gsplat-cpu are compiled as they are, with -O3 -march=native; its projection has
+torch's own gradients, its blending a backward function of its own. Versions of the checkout differ in what more that
+one takes (maps for densification, left out: then it does not compute them).
 """
 
 from __future__ import annotations

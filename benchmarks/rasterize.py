@@ -2,8 +2,9 @@
 """How fast the rasteriser is: `python benchmarks/rasterize.py [--opensplat DIR] [--ply FILE] [--out DIR]`.
 
 Random Gaussians in the unit ball (σ of 0.005 to 0.03, σ_t = 0.3), and an asset where one is given, in 4 views at 4
-times. CPU-ms on one thread, the best of several calls, forward and forward + backward from position, time, velocity, lifetime, scale, rotation, colour and opacity. With a checkout of OpenSplat, its CPU rasteriser does the
-same in the same run: see opensplat.py. To `--out` go rasterizer.csv, .md and .png.
+times. CPU-ms on one thread, the best of several calls, forward and forward + backward from position, time, velocity,
+lifetime, scale, rotation, colour and opacity. With a checkout of OpenSplat, its CPU rasteriser does the same in the
+same run: see opensplat.py. To `--out` go rasterizer.csv, .md and .png.
 
 The floor, counted, per (visible Gaussian, view) pair and per step of one block of pixels (8, or 16 with AVX-512) that
 the exact footprint needs at the least:
@@ -39,7 +40,7 @@ NAMES = ("scene", "gaussians", "pixels", "views", "forward_ms", "both_ms", "infe
 NAMES += ("times_floor", "opensplat_forward_ms", "opensplat_both_ms", "ratio", "psnr_db", "difference")
 
 
-def scene(n: int, seed: int = 0) -> Gaussians4D:
+def cloud(n: int, seed: int = 0) -> Gaussians4D:
     torch.manual_seed(seed)
     unit = torch.nn.functional.normalize
     return Gaussians4D(
@@ -67,6 +68,13 @@ def ring(size: int, views: int):
     f = 0.5 * size / math.tan(math.radians(25))
     K = torch.tensor([f, f, size / 2, size / 2]).expand(views, 4)
     return torch.stack(poses), K, torch.linspace(-0.8, 0.8, views), size, size
+
+
+def scene(n: int, size: int, views: int) -> tuple[list[torch.Tensor], tuple]:
+    """`cloud` as the seven leaves that `rasterize` takes, and `ring`."""
+    g = cloud(n)
+    leaves = (g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity)
+    return [x.requires_grad_() for x in leaves], ring(size, views)
 
 
 def floor(g: Gaussians4D, view) -> float:
@@ -233,7 +241,7 @@ def main():
     started = start_up()
     print(f"start-up after `import torch`, compiled code from the cache: {started:.2f} CPU-s", flush=True)
     other = opensplat.compiled(args.opensplat) if args.opensplat else None
-    jobs = [("random", scene(n), size) for n, size in (map(int, s.split("x")) for s in args.sizes.split(","))]
+    jobs = [("random", cloud(n), size) for n, size in (map(int, s.split("x")) for s in args.sizes.split(","))]
     if args.ply:
         jobs.append((args.ply.stem, Gaussians4D.from_asset(read_ply(args.ply)), 128))
     rows = []

@@ -306,7 +306,7 @@ class _Rasterize(torch.autograd.Function):
             _unblend_tiles(band, P, starts, pairs, slots, background, g_image[c], g_alpha[c], kept[c], sums[c])
 
         each(itertools.product(range(views), _bands(width, height)), unblend)
-        out = tuple(None if x is None else np.zeros_like(x) for x in inputs)
+        out = tuple(None if x is None else np.zeros(x.shape, np.float32) for x in inputs)
         count, parts = len(inputs[1]), torch.get_num_threads()
 
         def chain(part):  # every Gaussian has one owner, who adds the views in their order
@@ -315,8 +315,9 @@ class _Rasterize(torch.autograd.Function):
                 project.chain(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
 
         each([(k,) for k in range(parts)], chain)
-        grads = (torch.from_numpy(x) for x in out if x is not None)
-        return *[None] * 5, *(g.view(x.shape).to(x.dtype) for g, x in zip(grads, tensors, strict=True))
+        out = (x for x in out if x is not None)
+        grads = [torch.from_numpy(x.reshape(y.shape)) for x, y in zip(out, tensors, strict=True)]
+        return *[None] * 5, *(g if g.dtype == x.dtype else g.to(x.dtype) for g, x in zip(grads, tensors, strict=True))
 
 
 def rasterize(*args):
