@@ -35,6 +35,7 @@ from .reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruc
 from .tables import collect as collect  # for whoever scores single runs
 from .tables import gather, summarise, table, write_metrics
 from .threads import clock
+from .timeline import WORTH, Timeline
 from .views import Views, load_views
 
 # What a method cannot do: the paper has no figures for these either.
@@ -122,6 +123,8 @@ def draw(g: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
     """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
     paper's inference filters."""
     height, width = views.size
+    if isinstance(g, Gaussians4D) and len(g) > WORTH:
+        g = Timeline(g)
     with torch.no_grad():
         return render(g, views.c2w, views.intrinsics, views.time, width, height, inference=True)
 
