@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 import torch
 
+from timesplat.datagen.rigs import spherical
+from timesplat.datagen.sequence import opengl_to_opencv
 from timesplat.model import follow as follow_module
 from timesplat.model import lift as lift_module
 from timesplat.model.evaluate import draw
 from timesplat.model.follow import EXTENT, GRID, Points, constraints, scene_flow
+from timesplat.model.gaussians import rotation_matrix
 from timesplat.model.lift import lift, lift_geometry, tangent_frame
 from timesplat.model.metrics import psnr
-from timesplat.model.views import load_views, rays
+from timesplat.model.views import Views, load_views, rays
 
 FRAMES = list(range(24))
 
@@ -189,6 +192,28 @@ def test_tangent_frame_of_a_slanted_plane():
     torch.testing.assert_close(axes[0, :, 2], normal, atol=1e-5, rtol=0)
     torch.testing.assert_close(axes[0] @ axes[0].T, torch.eye(3), atol=1e-5, rtol=0)
     assert float(torch.linalg.det(axes)[0]) == pytest.approx(1, abs=1e-5)
+
+
+def test_footprints_on_a_slanted_square():
+    """A square in the plane y = 0, seen at 55 degrees: every Gaussian lies in it, as long as its pixel's ray is
+    slanted, and as wide as the pixel."""
+    c2w = torch.tensor(opengl_to_opencv(spherical(55, 0)), dtype=torch.float32)[None]
+    K = torch.tensor([[70.0, 70, 32, 32]])
+    origin, direction = rays(c2w, K, 64, 64)
+    distance = -origin[..., 1] / direction[..., 1]
+    hit = (origin + distance[..., None] * direction)[..., [0, 2]].abs().amax(-1) < 0.5
+    depth = torch.where(hit, distance * (direction * c2w[:, None, None, :3, 2]).sum(-1), torch.inf)
+    views = Views(torch.ones(1, 64, 64, 3), hit.float(), c2w, K, torch.zeros(1), 2.0, depth, torch.zeros(1, 64, 64, 4))
+    geometry = lift_geometry(views)
+    g, owner = geometry.gaussians, geometry.owner
+    axes = rotation_matrix(g.rotation)
+    assert (axes[..., 1, 2] < -0.9999).all()  # towards the camera
+    size = depth.flatten()[owner] / 70
+    slant = 1 / direction.reshape(-1, 3)[owner, 1]
+    centre = (direction.reshape(-1, 3)[owner] @ c2w[0, :3, 2]) > 0.995  # where a pixel is round
+    assert centre.sum() > 50
+    torch.testing.assert_close(g.scale[centre, 0], (0.35 * size * slant)[centre], rtol=0.04, atol=0)
+    torch.testing.assert_close(g.scale[centre, 1], (0.35 * size)[centre], rtol=0.04, atol=0)
 
 
 def test_a_lone_pixel_and_an_empty_view_are_finite(spheres):
