@@ -321,8 +321,9 @@ def check_methods(text: str) -> list[str]:
 
 def bench_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("assets", nargs="*", help="animated files, zoo:SEED, Sequences rendered with --rig evaluation "
-                   "--targets 1, or folders of either (default: 8 procedural objects no checkpoint saw)")  # fmt: skip
-    p.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write (default: out/bench)")
+                   "--targets 1, or folders of either (default: 6 procedural objects no checkpoint saw)")  # fmt: skip
+    p.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write (default: out/bench); another one "
+                   "after changing the code, as rows are kept")  # fmt: skip
     p.add_argument("--objects", type=int, help="only the first N objects")
     p.add_argument("--quick", action="store_true", help="2 objects unless --objects says, no fit of more than 3 "
                    "seconds, no chart of the renderer: some 4 minutes")  # fmt: skip
@@ -337,7 +338,7 @@ def bench_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def bench(args: argparse.Namespace) -> int:
-    """Speed against accuracy: every way from posed images to novel views, on held-out objects, in under 30 minutes
+    """Speed against accuracy: every way from posed images to novel views, on held-out objects, in some 25 minutes
     on two cores. Writes into --out: bench.csv (a row for each object and way), bench.md (means, machine, what is
     on the Pareto frontiers) and bench-*.png and .svg: quality against seconds and against size, Gaussian budgets,
     numbers of views and sizes, renderer samples. A run that was stopped goes on where it was."""
