@@ -21,8 +21,8 @@ F32 = np.float32
 LOG2E = math.log2(math.e)
 E_MIN = F32(math.log2(ALPHA_MIN))
 E_FILTER = math.log2(FILTER)
-# TRAP: numba's cache watches only the file that a function is in. After a change to a constant above or to
-# simd.py, touch the files that use it.
+# TRAP: numba's cache goes by the contents of the file that a function is in. After a change to a constant above or to
+# simd.py, delete __pycache__.
 serial = njit(cache=True, nogil=True, error_model="numpy")
 
 # One row per Gaussian that a view shows, in the order of the input. (u, v) = L d whitens the pixel offset d = (dx, dy),
