@@ -322,8 +322,8 @@ def check_methods(text: str) -> list[str]:
 def bench_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("assets", nargs="*", help="animated files, zoo:SEED, Sequences rendered with --rig evaluation "
                    "--targets 1, or folders of either (default: 6 procedural objects no checkpoint saw)")  # fmt: skip
-    p.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write (default: out/bench); another one "
-                   "after changing the code, as rows are kept")  # fmt: skip
+    p.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write (default: out/bench); "
+                   "another one after changing the code, as rows are kept")  # fmt: skip
     p.add_argument("--objects", type=int, help="only the first N objects")
     p.add_argument("--quick", action="store_true", help="2 objects unless --objects says, no fit of more than 3 "
                    "seconds, no chart of the renderer: some 4 minutes")  # fmt: skip
