@@ -118,7 +118,9 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
         if "refine" in label and not budget:
             labels.append((x[0], y[0], group[0].way.label, colour))
         if cost != "seconds":
-            hints += [(a, b, hint(m), colour) for a, b, m in zip(x, y, group, strict=True) if hint(m)]
+            said = {h[:3] for h in hints}
+            found = [(a, b, hint(m), colour) for a, b, m in zip(x, y, group, strict=True)]
+            hints += [h for h in found if h[2] and h[:3] not in said]
     for m in means:
         x, y, colour, error = m.mean[cost], m.mean[worth], FAMILIES[m.way.name], m.gain_error.get(worth, 0)
         drawn.append(([x, x], [y - error, y + error]))
