@@ -200,11 +200,15 @@ def draw_budgets(losses: dict):
         for i, (name, curve) in enumerate(curves.items()):
             colour, (n, gain, _) = COLOURS[i % len(COLOURS)], zip(*curve, strict=True)
             ax.plot(n, gain, color=colour, marker=MARKERS[i % 5], markersize=3.5, linewidth=1.1)
+            whole_n = [a for a, b, star in curve if b == 0 and not star]
+            ax.plot(whole_n[:1], [0], marker="o", markersize=7, color=colour, markerfacecolor="white", zorder=1.9)
             stars = [(a, b) for a, b, star in curve if star]
             ax.plot(*zip(*stars, strict=True), marker="*", markersize=9, color=colour, linestyle="none") if stars else 0
             labels.append((n[0], gain[0], name, colour))
             drawn.append((n, gain))
-        ax.set(xscale="log", xlabel="Gaussians (star: budget auto)", ylabel="PSNR against no budget (dB)")
+        ax.set(
+            xscale="log", xlabel="Gaussians (star: budget auto; ring: no budget)", ylabel="PSNR against no budget (dB)"
+        )
         ax.margins(0.14, 0.1)
         plain(ax)
         ax.set_title(whole, fontsize=9)
