@@ -154,6 +154,7 @@ def optimise(
     seconds: float,
     *,
     steps: int | None = None,
+    enough: int | None = None,
     beside: Views | None = None,
     batch: int = 2,
     coarse: int = COARSE,
@@ -168,7 +169,8 @@ def optimise(
 
     A step draws `scene()` from `batch` views (all views in turn, in random order) over `background` (3,) or
     a random colour, pictures larger than `coarse` pixels averaged down at first, and descends on `loss(step)`.
-    Views `beside`, where given, make up the rest of a step's share OWN of `views`.
+    After `enough` steps, where given, time that is left stays unused. Views `beside`, where given, make up the rest
+    of a step's share OWN of `views`.
     `edit(number, fraction)` may change the parameters' rows after a step, while their gradients are still there.
     `progress(fraction, text)` is called about ten times a second; without it a bar shows on a terminal after
     two seconds. Call inside of `gradients()`, with views from `own`."""
@@ -182,7 +184,8 @@ def optimise(
     while True:
         elapsed = clock() - start
         spent, most = (elapsed, seconds) if steps is None else (done, steps)
-        fraction = min(spent / most, 1.0) if most > 0 else 1.0
+        fraction = max(spent / most, done / enough if enough else 0.0) if most > 0 else 1.0
+        fraction = min(fraction, 1.0)
         if elapsed - told > 0.1 or fraction >= 1:
             told = elapsed
             bar.update(math.floor(100 * fraction) - bar.n)

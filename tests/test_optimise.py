@@ -68,3 +68,5 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
     assert done == 40 and optimise(p, scene, mine, photographs, 0.0) == 0
     torch.testing.assert_close(p["rgb"].detach()[0], torch.tensor([0.2, 0.5, 0.7]), atol=0.05, rtol=0)
     assert drawn[0] == (2, min(size, 100), min(size, 100), 3) and drawn[-1] == (2, size, size, 3)
+    with gradients():
+        assert optimise(p, scene, mine, photographs, 1e9, enough=3) == 3
