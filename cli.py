@@ -140,9 +140,11 @@ def reconstruct(args: argparse.Namespace) -> int:
     from .datagen.sequence import read_sequence
     from .model.asset import write_ply
     from .model.budget import parse
-    from .model.reconstruct import clip_of
+    from .model.coverage import SURFACES, coverage
+    from .model.reconstruct import NEEDS_PASSES, clip_of
     from .model.reconstruct import reconstruct as run
     from .model.refine import check_seconds
+    from .model.views import load_views
 
     start = time.perf_counter()
     check_seconds(args.refine)
@@ -166,6 +168,9 @@ def reconstruct(args: argparse.Namespace) -> int:
     )
     write_ply(args.out, g.to_asset(clip_of(seq)))
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {time.perf_counter() - start:.1f} s")
+    if args.method in SURFACES and not (args.refine or args.budget):
+        share, _ = coverage(g, load_views(seq, indices, args.method in NEEDS_PASSES))
+        print(f"coverage {share:.0%}" + ("" if share > 0.99 else ": what no camera saw is left open"))
     return 0
 
 

@@ -33,7 +33,7 @@ from ..datagen.sequence import InputError, Sequence, read_sequence
 from . import protocol
 from .asset import write_ply
 from .budget import SECONDS
-from .coverage import coverage
+from .coverage import SURFACES, coverage
 from .evaluate import Plan, append, draw, evaluate_views, key_of, load_inputs, load_truth, parse_method, read_rows
 from .evaluate import warm_up as warm_up_methods
 from .reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, clip_of
@@ -54,7 +54,6 @@ CENTRE += ["rgb+refine:0.3", "rgb+refine:0.6"]
 CENTRE += [f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in BUDGETS]
 CENTRE += [f"rgb+refine:3+budget:{n}" for n in (500, 1000, "auto")]
 AXES = ["lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3"]  # at other sizes and numbers of views
-COVERED = {"lift", "guided", "rgb", "sweep"}  # their Gaussians know which way their surface faces
 QUICK = 3.0  # seconds of fitting that a quick run has at the most
 
 FIGURES = ["seconds", "psnr", "psnr_fg", "ssim", "flip", "gaussians", "ply_mb", "usd_mb", "render_ms"]
@@ -197,7 +196,7 @@ def measure(name: str, seq: Sequence, point: Point) -> dict:
     draw(scene, truth.views)
     row["render_ms"] = 1000 * (clock() - start) / len(truth.picture)
     row["ply_mb"], row["usd_mb"] = megabytes(scene, seq)
-    row["coverage"] = coverage(scene, what)[0] if way.spec in COVERED else None
+    row["coverage"] = coverage(scene, what)[0] if way.spec in SURFACES else None
     row |= {"gaussians": row["gaussians_kept"], "object": name, "way": way.label, "setup": point.setup}
     row |= {"views": len(views), "size": point.size}
     return {k: row[k] for k in COLUMNS}

@@ -21,6 +21,7 @@ from .gaussians import Gaussians4D, rotation_matrix
 from .rasterize import render
 from .views import Views
 
+SURFACES = {"lift", "guided", "rgb", "sweep"}  # methods whose Gaussians know which way their surface faces
 GRID = 40  # voxels along [-1,1] that are seen to be empty, or not
 NEAR = 4.5  # a view speaks of the space at moments that are at most so many frames away …
 FEWEST = 8  # … and as many views as this are heard in any case

@@ -36,7 +36,8 @@ def test_road_from_sequence_to_usd(sphere_folder, tmp_path, capsys):
     ply, usd = tmp_path / "a.ply", tmp_path / "a.usdc"
     assert main(["reconstruct", str(sphere_folder), "--out", str(ply), "--method", "lift"]) == 0
     assert main(["export", str(ply), str(usd)]) == 0
-    assert "Gaussians" in capsys.readouterr().out and usd.stat().st_size > 10_000
+    said = capsys.readouterr().out
+    assert "Gaussians" in said and "coverage" in said and usd.stat().st_size > 10_000
 
 
 def test_missing_and_damaged_sequences(sphere_folder, tmp_path, capsys):

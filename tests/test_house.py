@@ -13,7 +13,7 @@ FLOORS = ("datagen", "model", "addon")
 FILES = sorted([*ROOT.glob("*.py"), *(f for floor in FLOORS for f in (ROOT / floor).rglob("*.py"))])
 NAMES = [f.relative_to(ROOT).as_posix() for f in FILES]
 TORCH_FREE = ("datagen/", "addon/", "model/asset.py", "model/usd.py")
-TENSORS = {"torch", "torchvision", "gsplat", "numba", "safetensors"}
+TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 
 
 def imports(name: str) -> set[str]:
