@@ -7,11 +7,14 @@ threshold (1/255, 0.999, 1e-4). Gradients of a random weighting of rgb and alpha
 each whole tensor, nothing set aside.
 """
 
+import importlib.machinery
 import math
+import sys
 
 import pytest
 import torch
 
+from timesplat.model import rasterize as package
 from timesplat.model.gaussians import Gaussians4D, rotation_matrix
 from timesplat.model.rasterize import rasterize, render
 
@@ -283,11 +286,22 @@ def test_wrong_arguments_are_named():
 
 
 def test_missing_gsplat_names_the_extra(monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(ImportError, match=r"timesplat\[cuda\]"):
         rasterize(*cloud(3).values(), *cameras(), backend="cuda")
+
+
+def test_gsplat_is_chosen_only_where_it_is_compiled(monkeypatch, tmp_path):
+    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "gsplat").mkdir()
+    (tmp_path / "gsplat/__init__.py").write_text("raise AssertionError('imported only to look')")
+    assert not package._gsplat_is_compiled()
+    (tmp_path / "gsplat" / f"csrc{importlib.machinery.EXTENSION_SUFFIXES[-1]}").touch()
+    importlib.invalidate_caches()
+    assert package._gsplat_is_compiled()
+    monkeypatch.setitem(sys.modules, "gsplat", None)  # as if not installed
+    assert not package._gsplat_is_compiled()
 
 
 @pytest.mark.cuda
@@ -298,7 +312,7 @@ def test_gsplat_equals_reference(name):
     g, view = next((g, v) for n, g, v in scenes() if n == name)
     want = with_gradients(g, view, "reference", torch.float64)
     g = {k: v.cuda().requires_grad_() for k, v in g.items()}
-    rgb, alpha = rasterize(*g.values(), *view)
+    rgb, alpha = rasterize(*g.values(), *view, backend="cuda")
     rng = torch.Generator().manual_seed(7)
     a, b = torch.randn(rgb.shape, generator=rng).cuda(), torch.randn(alpha.shape, generator=rng).cuda()
     ((rgb * a).sum() + (alpha * b).sum()).backward()

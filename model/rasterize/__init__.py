@@ -8,6 +8,7 @@ transmittance 1e-4), so that a model trained with one renders the same with anot
 
 from __future__ import annotations
 
+import importlib.machinery
 import importlib.util
 import math
 
@@ -55,7 +56,7 @@ def rasterize(
     background: one value or (3,). inference: skip, per view, Gaussians whose marginal or weighted opacity is
     below 0.05 (appendix A.2); not for training, where it would cut gradients. backend: "cpu" (float32 inside),
     "cuda" (gsplat), "triton" (CUDA with nothing but torch) or "reference" (slow; computes in the inputs'
-    precision); None goes by the device, and on CUDA by whether gsplat is installed.
+    precision); None goes by the device, and on CUDA takes gsplat where it is installed compiled.
 
     -> rgb (C,height,width,3) over the background, alpha (C,height,width), in the dtype of xyz.
     ValueError for a wrong shape, NaN or infinity, naming the tensor."""
@@ -92,7 +93,7 @@ def _rasterize(
         raise ValueError("rasterize: background must be one finite number or three")
 
     if backend is None:
-        backend = ("cuda" if importlib.util.find_spec("gsplat") else "triton") if xyz.is_cuda else "cpu"
+        backend = ("cuda" if _gsplat_is_compiled() else "triton") if xyz.is_cuda else "cpu"
     if backend == "cpu":
         from .cpu import rasterize as run
     elif backend == "cuda":
@@ -110,6 +111,14 @@ def _rasterize(
     if out is None:  # the CPU's backend looks for itself, in a tenth of the time
         _check_finite(inputs, torch.float32)
     return out
+
+
+def _gsplat_is_compiled() -> bool:
+    """Whether gsplat is here with its extension. The wheel on PyPI has none: its first call would compile for minutes,
+    or fail where there is no nvcc."""
+    gsplat = importlib.util.find_spec("gsplat")
+    # Not find_spec("gsplat.csrc"), which would import gsplat.
+    return bool(gsplat and importlib.machinery.PathFinder.find_spec("gsplat.csrc", gsplat.submodule_search_locations))
 
 
 def _check_finite(tensors: dict[str, Tensor], dtype=None) -> None:
