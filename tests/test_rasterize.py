@@ -9,7 +9,10 @@ each whole tensor, nothing set aside.
 
 import importlib.machinery
 import math
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -332,3 +335,25 @@ def test_a_moving_scene_is_drawn_from_its_state_at_each_time():
     args = (c2w, intrinsics, torch.tensor([0.5, -0.2, 0.5, 0.9]), width, height)
     for mine, expected in zip(render(Slices(), *args), render(g, *args), strict=True):
         torch.testing.assert_close(mine, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_kernels_are_compiled_again_when_a_file_they_share_changes(tmp_path):
+    """By itself numba's cache looks only at the file that a function is in."""
+    folder = tmp_path / "model" / "rasterize"
+    shutil.copytree(Path(package.__file__).parent, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "model" / "gaussians.py").write_text("Gaussians4D = Moving = None")
+    code = """
+import importlib, numpy
+from model.rasterize import project
+def hits():
+    kernel = importlib.reload(project).all_finite
+    kernel((numpy.ones(1, numpy.float32),))
+    return sum(kernel.stats.cache_hits.values())
+print(hits(), hits())
+for name in ("simd.py", "__init__.py"):
+    with open("model/rasterize/" + name, "a") as f:
+        f.write("# changed")
+    print(hits(), hits())
+"""
+    run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["0", "1"] * 3

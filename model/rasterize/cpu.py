@@ -20,6 +20,7 @@ import torch
 
 from ..threads import each
 from . import ALPHA_MAX, T_STOP, project
+from .chain import chain
 from .project import (
     BLUE, E_MIN, F32, GREEN, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE, UX, UY, VY, serial,
 )  # fmt: skip
@@ -309,12 +310,12 @@ class _Rasterize(torch.autograd.Function):
         out = tuple(None if x is None else np.zeros(x.shape, np.float32) for x in inputs)
         count, parts = len(inputs[1]), torch.get_num_threads()
 
-        def chain(part):  # every Gaussian has one owner, who adds the views in their order
+        def chain_part(part):  # every Gaussian has one owner, who adds the views in their order
             own = part * count // parts, (part + 1) * count // parts
             for c, (ids, _, _, _, _, first) in enumerate(drawn):
-                project.chain(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
+                chain(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
 
-        each([(k,) for k in range(parts)], chain)
+        each([(k,) for k in range(parts)], chain_part)
         out = (x for x in out if x is not None)
         grads = [torch.from_numpy(x.reshape(y.shape)) for x, y in zip(out, tensors, strict=True)]
         return *[None] * 5, *(g if g.dtype == x.dtype else g.to(x.dtype) for g, x in zip(grads, tensors, strict=True))
