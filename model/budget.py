@@ -17,10 +17,10 @@ from ..datagen.sequence import InputError
 from .fuse import contribution, fuse
 from .gaussians import Gaussians4D, Moving
 from .optimise import gradients, own
-from .refine import FADE, FUSED, LIFE, NEAR_PRICE, PRICE, RATES, around, error, fit, part, raw, refine
+from .refine import FADE, FUSED, LIFE, NEAR_PRICE, PIXELS, PRICE, RATES, around, error, fit, limit, part, raw, refine
 from .views import Views
 
-SECONDS = 5.0  # of fitting, where none are asked for
+SECONDS = 5.0  # of fitting, where none are asked for, at 128²; in proportion to the pixels above
 FEWEST = 500  # Gaussians to try first; then twice as many, and so on
 TRIAL = 1.5  # seconds of each try
 LEAST = 1.0  # pixels that a Gaussian must contribute in all of AROUND pictures together: a twentieth do not
@@ -52,15 +52,18 @@ def reduced(
     progress=None,
 ) -> Gaussians4D:
     """A prediction `start` from these views (`near`: with depth and motion) -> no more Gaussians than `budget` says,
-    refined for `seconds`, or SECONDS where 0. Raises InputError, also for a scene that is not of 4D Gaussians."""
+    refined for `seconds`, or SECONDS where 0; nor more than refinement uses by itself, but for auto. Raises
+    InputError, also for a scene that is not of 4D Gaussians."""
     wanted, search = parse(budget), 0.0
     if wanted is None and isinstance(start, Gaussians4D):
         search = 0.5  # of what is reported
         wanted, _ = fewest(start, views, max_loss, near=near, device=device, progress=part(progress, 0, search))
-    elif isinstance(wanted, float):
-        wanted = max(int(wanted * start.alive().sum()), 1) if isinstance(start, Gaussians4D) else 1
+    elif isinstance(start, Gaussians4D):
+        share = wanted * int(start.alive().sum()) if isinstance(wanted, float) else wanted
+        wanted = max(min(int(share), limit(views, near)), 1)
     told = part(progress, search, 1)
-    g = refine(start, views, seconds or SECONDS, device, near=near, count=wanted, progress=told)
+    seconds = seconds or SECONDS * max(views.alpha[0].numel() / PIXELS, 1.0)
+    g = refine(start, views, seconds, device, near=near, count=wanted, progress=told)
     with gradients():
         g = g.map(torch.clone)
         return g[contribution(g, around(g, own(views))) > LEAST] if len(g) else g

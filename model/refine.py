@@ -31,7 +31,9 @@ from .rasterize import render
 from .threads import clock
 from .views import Views
 
-COARSE = 64  # longest side in pixels of the pictures at first: 0.1 dB and a fifth more steps
+PIXELS = 128**2  # of a picture, to which seconds and numbers of Gaussians below refer
+SMALL = 64  # longest side in pixels of what a prediction from RGB is made of before it is fused; fits begin with
+# pictures of half the size, but no less: 0.1 dB and a fifth more steps
 JUDGES = 4  # input views that judge
 LOOKS = 6  # states on the way that are judged, the last one included
 FUSED = 2 / 3  # of the Gaussians wanted are fused from those predicted; the others are split off where the fit pulls
@@ -44,7 +46,7 @@ FADE = 0.3  # of opacity at the start: what hides the rest must not be there bef
 
 # A prediction from depth and motion:
 NEAR_FEW, NEAR_PRICE, NEAR_ENOUGH = 4000, 0.02, 3000  # after 1500 steps there were 0.0 to 0.3 dB left to win
-ALL = 4.0  # seconds up to which its Gaussians are all kept, and moved only a little: some 80 steps
+ALL = 4.0  # seconds, times PIXELS, up to which its Gaussians are all kept, and moved only a little: some 80 steps
 FIRST, LONGEST = 0.3, 3.0  # of more seconds this share, and so many at most, come before they are fused
 AROUND = 96  # pictures of them from other sides
 STEEPEST = 58  # degrees of elevation, up and down, of where these are taken
@@ -83,7 +85,7 @@ def refine(
 ) -> Gaussians4D:
     """Gaussians and the input views that they are of -> refined Gaussians on the CPU, after `seconds` or exactly
     `steps`; `start` itself for zero seconds, or where the views that judge fit no better. `near`: the start knows
-    depth and motion. count: most Gaussians, 1 or more; with it the result is of no more, even if it is worse.
+    depth and motion. count: how many Gaussians are wanted, 1 or more; the result has no more, even if it is worse.
     For `progress` see `optimise`.
 
     Raises InputError for a scene that is not of 4D Gaussians and for a wrong number of seconds."""
@@ -100,9 +102,11 @@ def refine(
             return start
         views = own(views, device)
         least, better, first = error(g, views[judging(views)]), None, 0.0
-        fusing = not near or count is not None or seconds > ALL
+        larger = views.alpha[0].numel() / PIXELS
+        fusing = not near or count is not None or seconds > ALL * larger
         if near:
-            first = min(FIRST, LONGEST / seconds if seconds else FIRST) if fusing else 1.0  # share of the budget
+            longest = LONGEST * larger / seconds if seconds else 1.0
+            first = min(FIRST, longest) if fusing else 1.0  # share of the budget
             whole = None if steps is None else round(first * steps)
             e, moved = fit(
                 raw(g), NEAR, views, first * seconds, steps=whole, seed=seed, progress=part(progress, 0, first)
@@ -110,7 +114,7 @@ def refine(
             if e < least:
                 g = better = moved
         if fusing:
-            most = count or (NEAR_FEW if near else FEW)
+            most = count or limit(views, near)
             few = fuse(g, max(int(FUSED * most), 1))
             beside = around(g, views, seed) if near else None
             values = raw(few) if near else raw(few, LIFE, FADE)
@@ -123,7 +127,7 @@ def refine(
                 most=most,
                 price=NEAR_PRICE if near else PRICE,
                 enough=NEAR_ENOUGH if near else ENOUGH,
-                coarse=COARSE,
+                coarse=max(-(-max(views.size) // 2), SMALL),
                 steps=None if steps is None else steps - round(first * steps),
                 seed=seed,
                 progress=part(progress, first, 1),
@@ -133,11 +137,16 @@ def refine(
         return start if better is None else better.to("cpu")
 
 
+def limit(views: Views, near: bool) -> int:
+    """Gaussians beyond which refinement does not gain; with depth and motion in proportion to the pictures' sides."""
+    return round(NEAR_FEW * (views.alpha[0].numel() / PIXELS) ** 0.5) if near else FEW
+
+
 def start_size(views: Views) -> Views:
-    """The views at a size of at most COARSE pixels, without depth and flow: after 4 seconds, what a prediction from RGB
+    """The views at a size of at most SMALL pixels, without depth and flow: after 4 seconds, what a prediction from RGB
     was made of at 64² or 128² was the same to 0.1 dB, on four development objects."""
     small = replace(views, depth=None, flow=None)
-    return shrunk(small, -(-max(views.size) // COARSE))
+    return shrunk(small, -(-max(views.size) // SMALL))
 
 
 def part(progress, first: float, last: float):
