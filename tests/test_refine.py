@@ -13,7 +13,7 @@ from timesplat.model.evaluate import evaluate_method, parse_method
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.lift import lift
 from timesplat.model.reconstruct import reconstruct_views
-from timesplat.model.refine import JUDGES, around, error, judging, part, refine
+from timesplat.model.refine import JUDGES, around, error, judging, part, refine, start_size
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +56,19 @@ def test_what_gets_no_better_stays(scene, monkeypatch):
     assert refine(none, inputs, 1.0) is none and refine(start[:0], inputs, 1.0).xyz.shape == (0, 3)
 
 
+def test_rgb_starts_from_small_pictures(spheres):
+    large = spheres(list(range(6)), size=200)
+    assert start_size(large).size == (50, 50) and start_size(large).depth is None
+    assert start_size(large[:5]).size == (200, 200)  # fewer are not fitted
+
+
 def test_views_that_judge_are_spread_over_the_clip(scene):
     inputs, _ = scene
     assert judging(inputs).tolist() == [3, 9, 15, 21] and len(judging(inputs)) == JUDGES
     assert judging(inputs[:3]).tolist() == [0, 1, 2] and judging(inputs[:1]).tolist() == [0]
-    assert isinstance(refine(lift(inputs[:3]), inputs[:3], 0, steps=3), Gaussians4D)
+    assert isinstance(refine(lift(inputs[:3]), inputs[:3], 0, steps=3, near=True), Gaussians4D)
+    few = lift(inputs[:5])
+    assert refine(few, inputs[:5], 0, steps=3) is few
 
 
 def test_pictures_from_around_are_what_the_gaussians_look_like(scene):
