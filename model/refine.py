@@ -247,8 +247,9 @@ def raw(g: Gaussians4D, life: float = 1e-6, fade: float = 1.0) -> dict[str, Tens
 
 @torch.no_grad()
 def around(g: Gaussians4D, views: Views, seed: int = 0, count: int = AROUND) -> Views:
-    """`count` pictures of the Gaussians from random sides at the moments of the views, taken as those are: from
-    their median distance to the origin, with the median of their intrinsics."""
+    """`count` pictures of the Gaussians from random sides at frames between the first and the last view, whether or not
+    a view shows them, taken as the views are: from their median distance to the origin, with the median of their
+    intrinsics."""
     rng = np.random.default_rng([seed, 11])
     distance = float(views.c2w[:, :3, 3].norm(dim=-1).median())
     steepest = math.sin(math.radians(STEEPEST))
@@ -256,8 +257,9 @@ def around(g: Gaussians4D, views: Views, seed: int = 0, count: int = AROUND) -> 
     poses = [spherical(a, e, distance) for a, e in zip(rng.uniform(0, 360, count), elevations, strict=True)]
     c2w = torch.from_numpy(opengl_to_opencv(np.stack(poses))).to(views.c2w)
     intrinsics = views.intrinsics.median(0).values.expand(count, 4).clone()
-    moments = views.time.unique()
-    time = moments[torch.from_numpy(rng.integers(len(moments), size=count)).to(moments.device)]
+    first, last = float(views.time.min()), float(views.time.max())
+    frames = round((last - first) / views.frame_step) + 1
+    time = first + views.frame_step * torch.from_numpy(rng.integers(frames, size=count)).to(views.time)
     height, width = views.size
     rgb, alpha = render(g, c2w, intrinsics, time, width, height, background=0.0, inference=True)
     rgb = rgb / alpha.clamp_min(1e-4)[..., None]  # straight

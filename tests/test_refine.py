@@ -75,7 +75,15 @@ def test_pictures_from_around_are_what_the_gaussians_look_like(scene):
     inputs, _ = scene
     g = lift(inputs)
     views = around(g, inputs, seed=3, count=5)
-    assert len(views) == 5 and views.size == inputs.size and set(views.time.tolist()) <= set(inputs.time.tolist())
+    assert len(views) == 5 and views.size == inputs.size
+    assert all((inputs.time - t).abs().min() < 1e-5 for t in views.time)
+    between = around(g, inputs[[4, 12]], seed=3, count=60).time  # frames that no view shows
+    assert (
+        between.unique().numel() > 5
+        and between.min() >= inputs.time[4] - 1e-5
+        and between.max() <= inputs.time[12] + 1e-5
+    )
+    assert around(g, inputs[[4]], count=3).time.tolist() == [float(inputs.time[4])] * 3
     assert error(g, views) < 1e-6  # over white, as they were drawn
     torch.testing.assert_close(views.c2w[:, :3, 3].norm(dim=-1), inputs.c2w[:5, :3, 3].norm(dim=-1))
     torch.testing.assert_close(torch.linalg.det(views.c2w[:, :3, :3]), torch.ones(5))
