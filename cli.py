@@ -362,7 +362,7 @@ def demo_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Render an animated object, reconstruct it three ways, export it, and lay everything side by side."""
+    """Render an animated object, reconstruct it several ways, export it, and lay everything side by side."""
     from .demo import run
 
     return run(args, save_blend)

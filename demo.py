@@ -21,9 +21,9 @@ from .model.usd import write_usd
 from .model.views import Views, load_views
 
 DEMO_SEED = 1_000_013  # a walking figure; checkpoints are trained on seeds below a million
-METHODS = ("white", "hull", "lift", "guided", "rgb")
-SHOWN = ("lift", "guided", "rgb")  # in pictures
-ASSET = "guided"  # the method whose Gaussians are exported
+METHODS = ("white", "hull", "lift", "guided", "guided+budget:10%", "rgb")
+SHOWN = ("lift", "guided", "guided+budget:10%", "rgb")  # in pictures
+ASSET = "guided+budget:10%"  # the method whose Gaussians are exported
 
 
 def run(args: argparse.Namespace, save_blend: Callable[[Path, Path], None]) -> int:
