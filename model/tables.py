@@ -143,7 +143,7 @@ def machine() -> dict:
     if cpuinfo.exists():
         names = [x.split(":", 1)[1].strip() for x in cpuinfo.read_text().splitlines() if x.startswith("model name")]
         name = names[0] if names else name
-    return {"cpu": name, "cores": len(os.sched_getaffinity(0)), "system": platform.platform()}
+    return {"cpu": name, "cores": len(os.sched_getaffinity(0)), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def versions() -> dict:
