@@ -20,8 +20,6 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-import os
-import platform
 import subprocess
 import sys
 import time
@@ -34,6 +32,7 @@ from timesplat.model.asset import read_ply
 from timesplat.model.gaussians import FIELDS, Gaussians4D
 from timesplat.model.rasterize import render
 from timesplat.model.rasterize.simd import ROWS
+from timesplat.model.tables import machine
 
 VISIBLE = 1 / 255
 NAMES = ("scene", "gaussians", "pixels", "views", "forward_ms", "both_ms", "inference_ms", "floor_ms")
@@ -143,12 +142,9 @@ def measure(name: str, g: Gaussians4D, size: int, views: int, seconds: float, ot
     return row
 
 
-def machine() -> str:
-    model = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
-    return f"{model}, {os.cpu_count()} cores, {8 * ROWS} floats a register"
+def computer() -> str:
+    found = machine()
+    return f"{found['cpu']}, {found['cores']} cores, {8 * ROWS} floats a register"
 
 
 def start_up() -> float:
@@ -191,8 +187,8 @@ def page(rows: list[dict], started: float) -> str:
     """rasterizer.md; started: CPU-seconds of the start."""
     text = f"""# The CPU rasteriser
 
-`python benchmarks/rasterize.py --opensplat DIR --ply FILE --out docs/results` on {machine()}: {rows[0]["views"]} views,
-CPU-ms on one thread, the best of several calls. Start-up after `import torch`: {started:.2f} CPU-s. The floor is
+`python benchmarks/rasterize.py --opensplat DIR --ply FILE --out docs/results` on {computer()}:
+{rows[0]["views"]} views, CPU-ms on one thread, the best of several calls. Start-up after `import torch`: {started:.2f} CPU-s. The floor is
 counted in the script.
 
 {table(rows)}"""
@@ -233,7 +229,7 @@ def chart(rows: list[dict], path: Path) -> None:
         text += f"\n{row['times_floor']:.1f} times the floor"
         names.append(text + (f"\n{row['ratio']:.1f} times faster" if "ratio" in row else ""))
     ax.set_xticks(range(len(rows)), names, fontsize=8)
-    ax.set_title(f"Rasterising {rows[0]['views']} views on one thread\n{machine()}", fontsize=10)
+    ax.set_title(f"Rasterising {rows[0]['views']} views on one thread\n{computer()}", fontsize=10)
     ax.legend(fontsize=8, frameon=False)
     ax.spines[["top", "right"]].set_visible(False)
     fig.savefig(path, dpi=150)
@@ -254,7 +250,7 @@ def main():
     args = parser.parse_args()
 
     torch.set_num_threads(1)
-    print(machine())
+    print(computer())
     started = start_up()
     print(f"start-up after `import torch`, compiled code from the cache: {started:.2f} CPU-s", flush=True)
     other = opensplat.compiled(args.opensplat) if args.opensplat else None
@@ -271,7 +267,7 @@ def main():
         with open(args.out / "rasterizer.csv", "w", newline="") as f:
             writer = csv.DictWriter(f, [*[k for k in NAMES if k in rows[0]], "machine"])
             writer.writeheader()
-            writer.writerows({**row, "machine": machine()} for row in rows)
+            writer.writerows({**row, "machine": computer()} for row in rows)
         (args.out / "rasterizer.md").write_text(page(rows, started))
         chart(rows, args.out / "rasterizer.png")
 

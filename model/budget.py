@@ -14,10 +14,10 @@ import re
 import torch
 
 from ..datagen.sequence import InputError
-from .fuse import contribution, fuse
+from .fuse import contribution
 from .gaussians import Gaussians4D, Moving
 from .optimise import gradients, own
-from .refine import FADE, FUSED, LIFE, NEAR_PRICE, PIXELS, PRICE, RATES, around, error, fit, limit, part, raw, refine
+from .refine import PIXELS, RATES, around, error, few, fit, judging, limit, part, refine
 from .views import Views
 
 SECONDS = 5.0  # of fitting, where none are asked for, at 128²; in proportion to the pixels above
@@ -28,7 +28,7 @@ HELD = 6  # input views that are held out
 
 
 def parse(text: str) -> int | float | None:
-    """ "N" -> N, "P%" -> P / 100, "auto" -> None. Raises InputError for anything else."""
+    """A number as it is, a share "P%" as P / 100, "auto" as None. Raises InputError for anything else."""
     if text == "auto":
         return None
     match = re.fullmatch(r"(\d+(?:\.\d+)?)(%?)", text)
@@ -79,16 +79,14 @@ def fewest(
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g, views = g[g.alive()], own(views, device)
-        order, n = views.time.argsort(stable=True).tolist(), min(HELD, max(len(views) // 4, 1))
-        held = [order[len(views) * (2 * i + 1) // (2 * n)] for i in range(n)]
+        held = judging(views, min(HELD, max(len(views) // 4, 1))).tolist()
         seen, unseen = views[[i for i in range(len(views)) if i not in held] or held], views[held]
         beside = around(g, views) if near else None
         tried: list[tuple[int, float]] = []
         number = FEWEST
         while number < len(g):
-            few = fuse(g, max(int(FUSED * number), 1))
             told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
-            values, price = (raw(few), NEAR_PRICE) if near else (raw(few, LIFE, FADE), PRICE)
+            values, price = few(g, number, near)
             _, fitted = fit(values, RATES, seen, TRIAL, beside=beside, most=number, price=price, progress=told)
             tried.append((number, -10 * math.log10(max(error(fitted, unseen), 1e-10))))
             if len(tried) > 1 and tried[-1][1] - tried[-2][1] <= max_loss:

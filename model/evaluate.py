@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from ..datagen.sequence import InputError, Sequence, read_sequence
 from . import protocol
+from .budget import parse as parse_budget
 from .data import shrink
 from .flip import features, flip
 from .gaussians import Gaussians4D, Moving
@@ -64,6 +65,8 @@ def parse_method(spec: str) -> Method:
     )
     if match and match[1] in METHODS:
         name, refine, budget, dense = match.groups()
+        if budget:
+            parse_budget(budget)
         return Method(name, refine and float(refine), budget, bool(dense))
     name = spec.strip().split("+")[0]
     if name not in METHODS:

@@ -33,15 +33,14 @@ def contribution(g: Gaussians4D, views: Views) -> Tensor:
 
 
 @torch.no_grad()
-def fuse(g: Gaussians4D, count: int, weight: Tensor | None = None) -> Gaussians4D:
+def fuse(g: Gaussians4D, count: int) -> Gaussians4D:
     """About `count` Gaussians (or all, if they are no more). Those are fused whose centres share a cell of a grid
     in space, at the middle of one of MOMENTS parts of the clip; those that stay in their cell all the time, over the
-    whole clip. weight (N,) >= 0: the share of each, its `contribution`, say; by default what it covers, for as long
-    as it lives, times its opacity."""
+    whole clip. The share of each is what it covers, for as long as it lives, times its opacity."""
     if len(g) <= count:
         return g
-    weight = _seen(g.opacity, g.scale, g.sigma_t) if weight is None else weight
-    weight = weight + 1e-9 * weight.mean() + 1e-30
+    seen = _seen(g.opacity, g.scale, g.sigma_t)
+    weight = seen + 1e-9 * seen.mean() + 1e-30
     part = ((g.t.clamp(-1, 1) + 1) / 2 * MOMENTS).floor().clamp_max(MOMENTS - 1)
     middle = (part + 0.5) / MOMENTS * 2 - 1
     way = 2 * g.velocity.norm(dim=-1)  # through the clip
@@ -68,7 +67,7 @@ def fuse(g: Gaussians4D, count: int, weight: Tensor | None = None) -> Gaussians4
     off = centre - xyz[owner]
     scale, rotation = scale_rotation_from_covariance(mean(g.covariance3() + off[:, :, None] * off[:, None]))
     sigma_t = mean(g.sigma_t.square() + (g.t - t[owner]).square()).sqrt()
-    mass = g.t.new_zeros(n).index_add(0, owner, _seen(g.opacity, g.scale, g.sigma_t))
+    mass = g.t.new_zeros(n).index_add(0, owner, seen)
     opacity = (mass / _seen(1.0, scale, sigma_t)).clamp(0.05, 0.9)
     return Gaussians4D(xyz, t, velocity, sigma_t, scale, rotation, mean(g.rgb), opacity)
 

@@ -116,9 +116,8 @@ def refine(
                 g = better = moved
         if fusing:
             most = count or limit(views, near)
-            few = fuse(g, max(int(FUSED * most), 1))
             beside = around(g, views, seed) if near else None
-            values = raw(few) if near else raw(few, LIFE, FADE)
+            values, price = few(g, most, near)
             e, fitted = fit(
                 values,
                 RATES,
@@ -126,7 +125,7 @@ def refine(
                 max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
                 beside=beside,
                 most=most,
-                price=NEAR_PRICE if near else PRICE,
+                price=price,
                 enough=NEAR_ENOUGH if near else ENOUGH,
                 coarse=max(-(-max(views.size) // 2), SMALL),
                 steps=None if steps is None else steps - round(first * steps),
@@ -136,6 +135,12 @@ def refine(
             if e < least or count is not None:
                 better = fitted
         return start if better is None else better.to("cpu")
+
+
+def few(g: Gaussians4D, count: int, near: bool) -> tuple[dict[str, Tensor], float]:
+    """Raw parameters of the Gaussians that a fit of `count` starts from, fused from `g`; and their price."""
+    fused = fuse(g, max(int(FUSED * count), 1))
+    return (raw(fused), NEAR_PRICE) if near else (raw(fused, LIFE, FADE), PRICE)
 
 
 def limit(views: Views, near: bool) -> int:
@@ -217,9 +222,9 @@ def fit(
     return best, kept
 
 
-def judging(views: Views) -> Tensor:
-    """(at most JUDGES,) indices of the views that judge, spread over the clip."""
-    order, n = views.time.argsort(stable=True), min(JUDGES, len(views))
+def judging(views: Views, count: int = JUDGES) -> Tensor:
+    """(at most `count`,) indices of the views that judge, spread over the clip."""
+    order, n = views.time.argsort(stable=True), min(count, len(views))
     return order[[len(views) * (2 * i + 1) // (2 * n) for i in range(n)]]
 
 

@@ -103,6 +103,7 @@ def test_method_specs():
         ("lift+fast", "in this order"),
         ("lift+budget:x", "lift..refine:SECONDS"),
         ("lift+budget:5+refine:1", "in this order"),
+        ("lift+budget:0%", "a number of Gaussians"),
     ):
         with pytest.raises(InputError, match=says):
             parse_method(spec)

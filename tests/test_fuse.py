@@ -58,9 +58,9 @@ def test_what_stands_still_is_one_for_the_whole_clip_and_what_moves_is_not():
     assert len(moving) == MOMENTS
 
 
-def test_weights_decide_the_means():
-    g = row(2, t=torch.zeros(2))
-    few = fuse(g, 1, torch.tensor([3.0, 1.0]))
+def test_who_is_seen_more_decides_the_means():
+    g = row(2, t=torch.zeros(2), opacity=torch.tensor([0.6, 0.2]))
+    few = fuse(g, 1)
     torch.testing.assert_close(few.rgb[0], 0.75 * g.rgb[0] + 0.25 * g.rgb[1])
 
 
