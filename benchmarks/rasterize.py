@@ -188,7 +188,8 @@ def page(rows: list[dict], started: float) -> str:
     text = f"""# The CPU rasteriser
 
 `python benchmarks/rasterize.py --opensplat DIR --ply FILE --out docs/results` on {computer()}:
-{rows[0]["views"]} views, CPU-ms on one thread, the best of several calls. Start-up after `import torch`: {started:.2f} CPU-s. The floor is
+{rows[0]["views"]} views, CPU-ms on one thread, the best of several calls.
+Start-up after `import torch`: {started:.2f} CPU-s. The floor is
 counted in the script.
 
 {table(rows)}"""
