@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Top floor, what an artist sees: import, display and the Reconstruct panel. bpy; never torch."""
+"""Top floor, what an artist sees: cameras, Reconstruct, the result, import and export. bpy; never torch."""
+
+from importlib import import_module
+
+# In the order in which they are registered; what comes later may use what comes before.
+MODULES = ("importer", "reconstruct")
 
 
 def register() -> None:
-    """Registers operators, panel and menu entry with Blender."""
-    from . import importer, reconstruct
-
-    importer.register()
-    reconstruct.register()
+    """Registers operators, panels and menu entries with Blender."""
+    for name in MODULES:
+        import_module(f".{name}", __package__).register()
 
 
 def unregister() -> None:
-    """Takes back what `register` did, and ends workers that still run."""
-    from . import importer, reconstruct
-
-    reconstruct.unregister()
-    importer.unregister()
+    """Takes back what `register` did, and ends child processes that still run."""
+    for name in reversed(MODULES):
+        import_module(f".{name}", __package__).unregister()
