@@ -180,7 +180,8 @@ def reconstruct(args: argparse.Namespace) -> int:
 def export_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote")
     p.add_argument("out", type=Path, help=".usdc, .usda, .usdz or .blend to write")
-    p.add_argument("--points-only", action="store_true", help="USD: points, without the Gaussian splat schema")
+    p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old readers "
+                   "take as points (default), points alone, splats sampled at every frame")  # fmt: skip
     p.add_argument("--half", action="store_true", help="USD: half precision")
 
 
@@ -193,7 +194,7 @@ def export(args: argparse.Namespace) -> int:
     if suffix in (".usd", ".usda", ".usdc", ".usdz"):
         from .model.usd import write_usd
 
-        write_usd(args.out, asset, points_only=args.points_only, half=args.half)
+        write_usd(args.out, asset, mode=args.mode, half=args.half)
     elif suffix == ".blend":
         save_blend(args.asset, args.out)
     else:

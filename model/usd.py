@@ -9,7 +9,7 @@ gives the Asset back. Needs numpy and pxr (usd-core).
 
 What is sampled over time
     positions   two samples where that says it all; one a frame, with |t - μ_t| held within REACH·σ_t, where
-                a short-lived Gaussian's line would leave the box long after it has faded.
+                a short-lived Gaussian's line would leave the box long after it has faded, or in mode frames.
     opacities   one a frame, rounded to 1/1000: so few different values are stored as a table, which makes
                 the file a third of the size. The exact ones can be had from primvars:gs4d:*.
     widths      one a frame: 0 while the Gaussian is invisible, so that a viewer of mere points shows
@@ -21,6 +21,7 @@ Spherical harmonics are sRGB-encoded, as in every 3DGS file; displayColor is lin
 from __future__ import annotations
 
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -35,6 +36,7 @@ BOX = 5.0  # how far, in normalised units, an invisible point may stray before p
 REACH = 4.0  # lifetimes after which a Gaussian stands still: exp(-½·4²) rounds to an opacity of 0
 EXTENT_SIGMAS = 3.0
 HALF_TINY, HALF_MAX = 2.0**-14, 65504.0
+MODES = ("splats", "points", "frames")
 SUFFIXES = (".usd", ".usdc", ".usda", ".usdz")
 
 
@@ -42,27 +44,34 @@ def _pxr():
     try:
         from pxr import Gf, Sdf, Usd, UsdUtils, Vt
     except ImportError:
-        raise InputError("USD files need the package usd-core; install it, or timesplat[usd].") from None
+        raise InputError(
+            f"{sys.executable} lacks the package usd-core, which USD files need; install it, or timesplat[usd], there."
+        ) from None
     return Gf, Sdf, Usd, UsdUtils, Vt
 
 
 # ---------------------------------------------------------------- writing
 
 
-def write_usd(path: str | Path, asset: Asset, *, points_only: bool = False, half: bool = False) -> None:
+def write_usd(path: str | Path, asset: Asset, *, mode: str = "splats", half: bool = False) -> None:
     """Writes .usd/.usdc (binary), .usda (text) or .usdz (package); whole or not at all.
 
-    points_only: the prim is plain `Points`, for pipelines that reference the file from a layer of their own
-    (fallbackPrimTypes is read from the root layer alone). half: everything but positions and opacities in half
-    precision (positions would lose up to 0.0005 of the object's half-side, opacities gain nothing; scales
-    and lifetimes below 2^-14 are raised to it, lifetimes above 65504 lowered). Raises InputError: wrong
-    suffix, bad arrays, the disk."""
+    mode   splats   the Gaussian splat prim, which older readers take as points
+           points   plain `Points`, for pipelines that reference the file from a layer of their own
+                    (fallbackPrimTypes is read from the root layer alone)
+           frames   as splats, with positions at every frame, for readers that do not interpolate
+    half   everything but positions and opacities in half precision (positions would lose up to 0.0005 of the
+           object's half-side, opacities gain nothing; scales and lifetimes below 2^-14 are raised to it,
+           lifetimes above 65504 lowered)
+    Raises InputError: wrong suffix or mode, bad arrays, the disk."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: the name must end in {', '.join(SUFFIXES)}; choose one of these.")
+    if mode not in MODES:
+        raise InputError(f"{mode}: no such mode; choose one of {', '.join(MODES)}.")
     check(asset, path)
     _, Sdf, _, UsdUtils, _ = _pxr()
-    stage = _stage(asset, points_only, half, path)
+    stage = _stage(asset, mode, half, path)
     with atomic(path) as tmp, tempfile.TemporaryDirectory() as folder:
         inner = Path(folder) / "splats.usdc" if path.suffix.lower() == ".usdz" else tmp
         try:
@@ -79,7 +88,7 @@ def write_usd(path: str | Path, asset: Asset, *, points_only: bool = False, half
         old.Reload(force=True)
 
 
-def _stage(asset: Asset, points_only: bool, half: bool, path: Path):
+def _stage(asset: Asset, mode: str, half: bool, path: Path):
     Gf, Sdf, Usd, _, Vt = _pxr()
     clip, T = asset.clip, Sdf.ValueTypeNames
     stage = Usd.Stage.CreateInMemory()
@@ -97,9 +106,9 @@ def _stage(asset: Asset, points_only: bool, half: bool, path: Path):
         "displayColor is linear; primvars:gs4d:* are the parameters in time -1..1 over the clip.",
     }.items():
         stage.SetMetadata(key, value)
-    if not points_only:
+    if mode != "points":
         stage.SetMetadata("fallbackPrimTypes", {SPLAT: Vt.TokenArray(["Points"])})
-    prim = stage.DefinePrim(PRIM, "Points" if points_only else SPLAT)
+    prim = stage.DefinePrim(PRIM, "Points" if mode == "points" else SPLAT)
 
     def put(name: str, kind, value, *, uniform=False, primvar=False) -> None:
         """value: one value, or {time code: value}."""
@@ -137,7 +146,7 @@ def _stage(asset: Asset, points_only: bool, half: bool, path: Path):
     order = Vt.TokenArray(["xformOp:translate", "xformOp:scale"])
     put("xformOpOrder", T.TokenArray, order, uniform=True)
 
-    positions = {c: f3(p) for c, p in _positions(asset, path).items()}
+    positions = {c: f3(p) for c, p in _positions(asset, mode == "frames", path).items()}
     positions = positions if len(positions) > 1 else next(iter(positions.values()))
     curve = {float(f): asset.at(asset.frame_to_time(f))[1] for f in clip.frames}
     faded = {c: np.round(o * 1000) / 1000 for c, o in curve.items()}
@@ -151,7 +160,7 @@ def _stage(asset: Asset, points_only: bool, half: bool, path: Path):
     prim.SetCustomDataByKey("timesplat:pixel", float(clip.pixel))
     rotations = packed(quats, asset.rotation[:, [1, 2, 3, 0]])  # FromNumpy takes x y z w
     put("primvars:gs4d:scale", kind3, scales, primvar=True)  # stored once where both are the same
-    if points_only:
+    if mode == "points":
         put("primvars:gs4d:rotation", kind4, rotations, primvar=True)
         put("primvars:gs4d:rgb", kind3, packed(s3, asset.rgb), primvar=True)
     else:
@@ -171,8 +180,9 @@ def _stage(asset: Asset, points_only: bool, half: bool, path: Path):
     return stage
 
 
-def _positions(asset: Asset, path: Path) -> dict[float, np.ndarray]:
-    """{time code: (N,3)}: one sample if nothing moves, two if no line leaves the box, else one a frame."""
+def _positions(asset: Asset, every: bool, path: Path) -> dict[float, np.ndarray]:
+    """{time code: (N,3)}: one sample if nothing moves, two if no line leaves the box, else (or if `every`)
+    one a frame."""
     clip = asset.clip
 
     def held(time: float) -> np.ndarray:
@@ -185,7 +195,7 @@ def _positions(asset: Asset, path: Path) -> dict[float, np.ndarray]:
         ends = {float(f): asset.at(t)[0] for f, t in ((clip.frame_start, -1.0), (clip.frame_end, 1.0))}
         astray = [(np.abs(p) > BOX) & (p != held(t)) for p, t in zip(ends.values(), (-1, 1), strict=True)]
         samples = ends
-        if any(a.any() for a in astray):
+        if every or any(a.any() for a in astray):
             samples = {float(f): held(asset.frame_to_time(f)) for f in clip.frames}
     if not all(np.isfinite(p).all() for p in samples.values()):
         raise InputError(f"{path}: velocity is so large that positions overflow; reconstruct it again.")

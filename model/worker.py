@@ -1,14 +1,30 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The process that the add-on talks to: `python -m timesplat.model.worker [request.json]`.
 
-It reads one JSON object, from the file named or else from the first line of standard input:
-    sequence    folder of a Sequence            asset       .ply to write
-    method      lift | guided | rgb | …         device      "cpu" (default), "cuda", …
-    checkpoint  weights to use, or null         indices     views to use, or null for all
+It reads one JSON object, from the file named or else from the first line of standard input. Its "task" says what
+to do; null or "" is the same as leaving a key out:
+    reconstruct (default)
+        sequence    folder of a Sequence            asset       .ply to write
+        method      lift | guided | rgb | …         device      "cpu" (default), "cuda", …
+        checkpoint  weights to use                  indices     views to use (default: all)
+        refine      seconds of fitting (0)          budget      "N", "P%" or "auto"
+        max_loss    dB that "auto" may lose (0.1)
+        done: asset, gaussians
+    export          USD, where Blender has none     (never imports torch)
+        asset       .ply to read                    out         .usd* to write
+        mode        splats | points | frames        half        true or false
+        done: out, complaints (the validator's, a list of sentences), bytes
+    import          the other way round             (never imports torch)
+        source      .usd* to read                   asset       .ply to write
+        done: asset, gaussians
+    selftest        does this interpreter reconstruct?
+        device, checkpoint
+        done: report (a list of lines)
+and with any task
     watch       true: stop when standard input closes, that is when the program that asked is gone
-and answers with one JSON object a line on standard output:
+It answers with one JSON object a line on standard output:
     {"event": "progress", "fraction": 0..1, "text": …}
-    {"event": "done", "asset": path, "gaussians": N, "seconds": s}        exit code 0
+    {"event": "done", …, "seconds": s}                                    exit code 0
     {"event": "error", "message": one sentence}                           exit code 1
 Whatever a library prints goes to standard error, so that the answers stay whole.
 """
@@ -16,6 +32,7 @@ Whatever a library prints goes to standard error, so that the answers stay whole
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import threading
@@ -27,7 +44,14 @@ from typing import TextIO
 
 from ..datagen.sequence import InputError, read_sequence
 
-_KEYS = {"sequence": str, "asset": str, "method": str, "device": str, "checkpoint": str, "indices": list, "watch": bool}
+_KINDS = {"text": str, "number": (int, float), "true or false": bool, "list": list}
+_KEYS = {
+    "task": "text", "watch": "true or false", "sequence": "text", "asset": "text", "method": "text",
+    "device": "text", "checkpoint": "text", "indices": "list", "refine": "number", "budget": "text",
+    "max_loss": "number", "out": "text", "mode": "text", "half": "true or false", "source": "text",
+}  # fmt: skip
+_NEEDED = {"reconstruct": ("sequence", "asset"), "export": ("asset", "out"), "import": ("source", "asset")}
+_NEEDED |= {"selftest": ()}
 
 
 def main(argv: list[str]) -> int:
@@ -37,14 +61,17 @@ def main(argv: list[str]) -> int:
     def say(event: str, **values) -> None:
         print(json.dumps({"event": event, **values}), file=answers, flush=True)
 
-    start = time.monotonic()
+    def progress(fraction: float, text: str) -> None:
+        say("progress", fraction=round(float(fraction), 4), text=str(text))
+
+    start, task = time.monotonic(), "request"
     try:
         request = _request(argv)
+        task = request.setdefault("task", "reconstruct")
         if request.get("watch"):
             threading.Thread(target=_leave_when_stdin_closes, daemon=True).start()
-        count = _reconstruct(request, lambda f, text: say("progress", fraction=round(float(f), 4), text=str(text)))
-        seconds = round(time.monotonic() - start, 3)
-        say("done", asset=request["asset"], gaussians=count, seconds=seconds)
+        do = {"reconstruct": _reconstruct, "export": _export, "import": _import, "selftest": _selftest}[task]
+        say("done", **do(request, progress), seconds=round(time.monotonic() - start, 3))
     except InputError as e:
         say("error", message=str(e))
         return 1
@@ -54,37 +81,91 @@ def main(argv: list[str]) -> int:
     except Exception as e:
         traceback.print_exc()
         why = " ".join(str(e).split())[:300]
-        say("error", message=f"The reconstruction stopped with {type(e).__name__}: {why}")
+        name = {"reconstruct": "reconstruction", "selftest": "self-test"}.get(task, task)
+        say("error", message=f"The {name} stopped with {type(e).__name__}: {why}")
         return 1
     return 0
 
 
-def _reconstruct(request: dict, progress) -> int:
+def _reconstruct(request: dict, progress) -> dict:
     progress(0.0, "starting")
     sequence = read_sequence(Path(request["sequence"]))
+    views, indices = len(sequence.views), request.get("indices")
+    for i in indices or []:
+        if type(i) is not int or not 0 <= i < views:
+            raise InputError(f"{sequence.root}: it has no view {i!r}; give numbers from 0 to {views - 1}.")
+    max_loss = request.get("max_loss", 0.1)
+    if not (math.isfinite(max_loss) and max_loss > 0):
+        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
     from .asset import write_ply
 
-    # A third of torch's start-up: what shapes its operations return, for compilers, which are not used here.
-    sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
+    method, refine, budget = request.get("method", "guided"), request.get("refine", 0.0), request.get("budget")
+    if not (refine or budget or method in ("4dgs", "som")):
+        # A third of torch's start-up: what shapes its operations return, for compilers. What fits uses
+        # torch.optim, which loads them.
+        sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
     from .reconstruct import clip_of, reconstruct  # imports torch
 
+    if refine or budget:  # refuse now what else is found out after seconds
+        from .budget import parse
+        from .refine import check_seconds
+
+        check_seconds(refine)
+        if budget:
+            parse(budget)
     checkpoint = request.get("checkpoint")
     gaussians = reconstruct(
         sequence,
-        request.get("method") or "guided",
-        indices=request.get("indices"),
-        device=request.get("device") or "cpu",
+        method,
+        indices=indices,
+        device=request.get("device", "cpu"),
         checkpoint=Path(checkpoint) if checkpoint else None,
         progress=lambda fraction, text: progress(0.05 + 0.9 * fraction, text),
+        refine=refine,
+        budget=budget,
+        max_loss=max_loss,
     )
     if len(gaussians) == 0:
         raise InputError(f"{sequence.root}: nothing was found to reconstruct; check that views show the object.")
     progress(0.95, "writing the asset")
     write_ply(request["asset"], gaussians.to_asset(clip_of(sequence)))
-    return len(gaussians)
+    return {"asset": request["asset"], "gaussians": len(gaussians)}
+
+
+def _export(request: dict, progress) -> dict:
+    from .asset import read_ply
+    from .usd import check_usd, write_usd
+
+    out = Path(request["out"])
+    progress(0.0, "reading the asset")
+    asset = read_ply(request["asset"])
+    progress(0.2, f"writing {out.name}")
+    write_usd(out, asset, mode=request.get("mode", "splats"), half=request.get("half", False))
+    progress(0.7, f"checking {out.name}")
+    return {"out": request["out"], "complaints": check_usd(out), "bytes": out.stat().st_size}
+
+
+def _import(request: dict, progress) -> dict:
+    from .asset import write_ply
+    from .usd import read_usd
+
+    progress(0.0, f"reading {Path(request['source']).name}")
+    asset = read_usd(request["source"])
+    progress(0.7, "writing the asset")
+    write_ply(request["asset"], asset)
+    return {"asset": request["asset"], "gaussians": len(asset)}
+
+
+def _selftest(request: dict, progress) -> dict:
+    from .selftest import selftest
+
+    checkpoint = request.get("checkpoint")
+    report = selftest(request.get("device", "cpu"), Path(checkpoint) if checkpoint else None, progress)
+    return {"report": report}
 
 
 def _request(argv: list[str]) -> dict:
+    """The request without keys that are null or empty; raises InputError."""
     source = argv[0] if argv else "standard input"
     try:
         text = Path(argv[0]).read_text() if argv else sys.stdin.readline()
@@ -93,12 +174,17 @@ def _request(argv: list[str]) -> dict:
             raise ValueError("it is not an object")
     except (OSError, ValueError) as e:
         raise InputError(f"{source}: the request cannot be read ({e}); give one JSON object.") from None
+    request = {key: value for key, value in request.items() if value not in (None, "")}
     for key, value in request.items():
         if key not in _KEYS:
             raise InputError(f"{source}: unknown key {key}; known are {', '.join(_KEYS)}.")
-        if value is not None and not isinstance(value, _KEYS[key]):
-            raise InputError(f"{source}: {key} must be of type {_KEYS[key].__name__}; correct it.")
-    for key in ("sequence", "asset"):
+        kind = _KEYS[key]
+        if not isinstance(value, _KINDS[kind]) or (kind == "number" and isinstance(value, bool)):
+            raise InputError(f"{source}: {key} must be a {kind}; correct it.".replace("a true", "true"))
+    task = request.get("task", "reconstruct")
+    if task not in _NEEDED:
+        raise InputError(f"{source}: no task {task}; choose one of {', '.join(_NEEDED)}.")
+    for key in _NEEDED[task]:
         if not request.get(key):
             raise InputError(f"{source}: {key} is missing; name a path.")
     return request

@@ -49,7 +49,7 @@ def splats(path):
 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usd", ".usdz"])
-@pytest.mark.parametrize("options", [{}, {"points_only": True}, {"half": True}, {"points_only": True, "half": True}])
+@pytest.mark.parametrize("options", [{}, {"mode": "points"}, {"half": True}, {"mode": "points", "half": True}])
 @pytest.mark.parametrize("asset", [make(), stray()], ids=["lines", "stray"])
 def test_written_files_are_clean_and_read_back(tmp_path, suffix, options, asset):
     path = tmp_path / f"a{suffix}"
@@ -145,7 +145,7 @@ def test_extent_is_that_of_the_visible(tmp_path):
 
 def test_widths_are_zero_while_invisible(tmp_path):
     a = make()
-    write_usd(tmp_path / "a.usdc", a, points_only=True)
+    write_usd(tmp_path / "a.usdc", a, mode="points")
     _stage, prim = splats(tmp_path / "a.usdc")
     assert prim.GetTypeName() == "Points"
     for frame in (10, 20, 33):
@@ -282,7 +282,7 @@ def child(code, *args) -> str:
     return line.removeprefix("RESULT")
 
 
-@pytest.mark.parametrize("options", [{}, {"points_only": True}], ids=["fallback", "points"])
+@pytest.mark.parametrize("options", [{}, {"mode": "points"}], ids=["fallback", "points"])
 def test_blender_reads_it_as_a_point_cloud_that_scrubs(tmp_path, options):
     asset = stray()
     write_usd(tmp_path / "a.usdc", asset, **options)

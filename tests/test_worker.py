@@ -11,7 +11,7 @@ import pytest
 
 from timesplat.datagen.sequence import Passes, Sequence, View, focal_from_fov, opengl_to_opencv, write_passes
 from timesplat.datagen.sequence import write_sequence as write
-from timesplat.model.asset import read_ply
+from timesplat.model.asset import ARRAYS, Asset, Clip, read_ply, write_ply
 
 
 def ask(*argv, stdin="", code=None):
@@ -72,15 +72,46 @@ def test_lift(tmp_path, sequence):
         ("{", "cannot be read"),
         ("[]", "not an object"),
         ('{"asset": "a.ply"}', "sequence is missing"),
-        ('{"sequence": 3, "asset": "a"}', "sequence must be of type str"),
+        ('{"sequence": 3, "asset": "a"}', "sequence must be a text"),
         ('{"sequence": "nowhere", "asset": "a.ply", "method": "lift"}', "nowhere"),
         ('{"colour": 1}', "unknown key colour"),
+        ('{"task": "dance"}', "no task dance; choose one of reconstruct, export, import, selftest"),
+        ('{"task": "export", "asset": "a.ply"}', "out is missing"),
+        ('{"task": "export", "asset": "a.ply", "out": "a.usdc", "half": 1}', "half must be true or false"),
+        ('{"task": "export", "asset": "nowhere.ply", "out": "a.usdc"}', "nowhere.ply"),
+        ('{"task": "import", "asset": "a.ply"}', "source is missing"),
+        ('{"task": "import", "source": "nowhere.usdc", "asset": "a.ply"}', "nowhere.usdc: no such file"),
+        ('{"sequence": "a", "asset": "b", "refine": true}', "refine must be a number"),
     ],
 )
 def test_bad_requests_are_answered_with_one_sentence(request_, word):
     code, said, _ = ask(stdin=request_ + "\n")
     assert code == 1 and said[-1]["event"] == "error"
     assert word in said[-1]["message"] and "\n" not in said[-1]["message"]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"refine": -1}, "-1 seconds of refinement: give 0 or more"),
+        ({"budget": "half"}, "half: no budget"),
+        ({"budget": "auto", "max_loss": 0}, "0 dB of loss"),
+        ({"indices": [0, 99]}, "it has no view 99; give numbers from 0 to 3"),
+        ({"indices": ["a"]}, "it has no view 'a'"),
+    ],
+)
+def test_impossible_wishes_are_refused_before_the_work(tmp_path, sequence, options, word):
+    request = {"sequence": str(sequence), "asset": str(tmp_path / "a.ply"), "method": "lift", **options}
+    code, said, _ = ask(stdin=json.dumps(request) + "\n")
+    assert code == 1 and word in said[-1]["message"]
+    assert [s["text"] for s in said[:-1]] == ["starting"] and not list(tmp_path.iterdir())
+
+
+def test_a_budget_and_refinement_are_passed_on(tmp_path, sequence):
+    request = {"sequence": str(sequence), "asset": str(tmp_path / "a.ply"), "method": "lift"}
+    code, said, _ = ask(stdin=json.dumps({**request, "refine": 0.2, "budget": "50", "max_loss": 0.5}) + "\n")
+    assert code == 0, said
+    assert 0 < said[-1]["gaussians"] == len(read_ply(tmp_path / "a.ply")) <= 50
 
 
 NOISY = """
@@ -105,6 +136,25 @@ def test_what_libraries_print_does_not_reach_the_protocol():
         assert words in err
 
 
+TALK = """
+import sys
+from types import ModuleType
+fake = sys.modules["timesplat.model.selftest"] = ModuleType("selftest")
+def selftest(device, checkpoint, progress):
+    progress(0.5, "half")
+    return [device, str(checkpoint)]
+fake.selftest = selftest
+from timesplat.model import worker
+sys.exit(worker.main([]))
+"""
+
+
+def test_the_self_test_is_asked_and_its_report_handed_on():
+    code, said, _ = ask(stdin='{"task": "selftest", "device": "cuda", "checkpoint": "a.safetensors"}\n', code=TALK)
+    assert code == 0 and said[0]["text"] == "half"
+    assert said[-1]["event"] == "done" and said[-1]["report"] == ["cuda", "a.safetensors"]
+
+
 LISTING = """
 import json, sys
 from timesplat.model import worker
@@ -125,6 +175,35 @@ def test_nothing_heavy_is_imported_that_it_does_not_use(tmp_path, sequence, meth
     loaded = json.loads(err.splitlines()[-1])["loaded"]
     assert "torch" in loaded and "numba" in loaded
     assert [name for name in HEAVY if name in loaded] == []
+
+
+def test_usd_and_back_without_torch(tmp_path):
+    pytest.importorskip("pxr")
+    rng = np.random.default_rng(0)
+    n = 20
+    one = {"t": rng.uniform(-1, 1, n), "sigma_t": rng.uniform(0.1, 1, n), "opacity": rng.uniform(0.1, 1, n)}
+    three = {k: rng.uniform(0.01, 0.5, (n, 3)) for k in ("xyz", "velocity", "scale", "rgb")}
+    arrays = {**one, **three, "rotation": np.tile([1, 0, 0, 0], (n, 1))}
+    asset = Asset(**{k: v.astype(np.float32) for k, v in arrays.items()}, clip=Clip(25, 3, 9, 2.0, (1, 2, 3)))
+    ply, usd, back = (str(tmp_path / name) for name in ("a.ply", "a.usdz", "b.ply"))
+    write_ply(ply, asset)
+    write = {"task": "export", "asset": ply, "out": usd, "mode": "frames", "half": False, "watch": None}
+    for request in (write, {"task": "import", "source": usd, "asset": back}):
+        code, said, err = ask(stdin=json.dumps(request) + "\n", code=LISTING)
+        assert code == 0 and said[0]["event"] == "progress", said
+        loaded = json.loads(err.splitlines()[-1])["loaded"]
+        assert "pxr" in loaded and not {"torch", "numba", "bpy", "PIL"} & set(loaded)
+        if request["task"] == "export":
+            assert {"event", "out", "complaints", "bytes", "seconds"} == set(said[-1])
+            assert said[-1]["complaints"] == [] and said[-1]["bytes"] == (tmp_path / "a.usdz").stat().st_size
+    assert said[-1]["gaussians"] == n and said[-1]["asset"] == back
+    a, b = read_ply(ply), read_ply(back)
+    assert a.clip == b.clip
+    for name in ARRAYS:
+        np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=3e-6, err_msg=name)
+    request |= {"source": ply}
+    code, said, _ = ask(stdin=json.dumps(request) + "\n")
+    assert code == 1 and "not a USD file" in said[-1]["message"]
 
 
 WAITING = """
