@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Makes the model runtime: a virtual environment with all that `model.worker` needs. A script of the standard library
+alone, which Blender's own Python runs as a child process; the protocol is that of `process`.
+
+    {"task": "install", "folder": F, "work": W, "build": "cpu" | "cuda"}
+        makes F; W: an existing folder on the same disk, which the caller removes afterwards. All is made in W and
+        moved to F when it is whole and its packages have been imported: what fails or is killed leaves F as it was.
+        done {"python": path within F, "build", "versions": {package: version}, "bytes": n}, also kept in
+        F/timesplat.json
+    {"task": "uninstall", "folder": F, "work": W}   done {"bytes": freed}
+
+pip's configuration counts (a mirror, a proxy, certificates, constraints). Where it names no index of its own, torch
+comes from PyTorch's index for the build (https://pytorch.org/get-started), the rest from pip's default.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import queue
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+# What the worker needs: package, oldest version, the module that proves it. (numpy may be 2 or newer here: only
+# beside bpy 5.0's wheel must it be older.)
+NEEDS = (
+    ("torch", "2.6", "torch"),
+    ("numba", "0.60", "numba"),
+    ("safetensors", "0.5", "safetensors"),
+    ("numpy", "1.26", "numpy"),
+    ("pillow", "11", "PIL"),
+    ("tqdm", "4.66", "tqdm"),
+    ("OpenEXR", "3.3", "OpenEXR"),
+    ("usd-core", "26.3", "pxr"),
+)
+BUILDS = {"cpu": "https://download.pytorch.org/whl/cpu", "cuda": "https://download.pytorch.org/whl/cu128"}
+DOWNLOAD = {"cpu": 300e6, "cuda": 4e9}  # bytes, roughly, so that the bar moves evenly
+ELSEWHERE = "or name a Python that has timesplat[torch] in Timesplat's preferences"
+NETWORK = (
+    r"NewConnectionError|ConnectTimeout|ReadTimeout|NameResolutionError|getaddrinfo|ProxyError|SSLError|Max retries|"
+    r"Network is unreachable|Connection (refused|reset|aborted)|Temporary failure in name resolution"
+)
+NO_ROOM = r"No space left on device|Disk quota exceeded|not enough space on the disk|WinError 112"
+PROOF = """
+import importlib, importlib.metadata, json, sys
+versions = {}
+for name, _, module in json.loads(sys.argv[1]):
+    print("importing", name, file=sys.stderr, flush=True)
+    importlib.import_module(module)
+    versions[name] = importlib.metadata.version(name)
+print(json.dumps(versions))
+"""
+
+
+class Stop(Exception):
+    """Why it cannot go on, in one sentence."""
+
+
+def main() -> int:
+    """Answers the one request on standard input; returns the exit code."""
+
+    def say(event: str, **values) -> None:
+        print(json.dumps({"event": event, **values}), flush=True)
+
+    def progress(fraction: float, text: str) -> None:
+        say("progress", fraction=round(fraction, 4), text=text)
+
+    try:
+        request = json.loads(sys.stdin.readline())
+        if request.get("watch"):
+            threading.Thread(target=_leave_when_stdin_closes, daemon=True).start()
+        folder, work = Path(request["folder"]), Path(request["work"])
+        if request["task"] == "install":
+            say("done", **install(folder, work, request["build"], progress))
+        else:
+            say("done", bytes=uninstall(folder, work, progress))
+    except Stop as e:
+        say("error", message=str(e))
+        return 1
+    except OSError as e:
+        say("error", message=_no_room(work) if e.errno == 28 else f"{e.filename or folder}: {e.strerror or e}.")
+        return 1
+    return 0
+
+
+def install(folder: Path, work: Path, build: str, progress) -> dict:
+    """See the module. progress(fraction 0..1, text). Raises Stop, OSError."""
+    new = work / "venv"
+    progress(0.0, "making a virtual environment")
+    pip = _make_venv(new)
+    python = _python_in(new)
+    wanted = [f"{name}>={version}" for name, version, _ in NEEDS]
+    if _has_index(pip):
+        steps = [(wanted, [], 0.05, 0.92)]
+    else:
+        steps = [(wanted[:1], ["--index-url", BUILDS[build]], 0.05, 0.7), (wanted[1:], [], 0.7, 0.92)]
+    for packages, options, first, last in steps:
+        command = [*pip, "install", "--no-cache-dir", "--no-compile", "--only-binary", ":all:", "--no-input"]
+        command += ["--disable-pip-version-check", "--progress-bar", "off", *options, *packages]
+        _install(command, new, work, build, lambda f, text, a=first, b=last: progress(a + (b - a) * f, text))
+    progress(0.92, "importing what was installed")
+    versions = _prove(python)
+    progress(0.98, "moving it into place")
+    told = {"python": str(python.relative_to(new)), "build": build, "versions": versions, "bytes": size(new)}
+    (new / "timesplat.json").write_text(json.dumps(told))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    old = work / "old"
+    if folder.exists():
+        _move(folder, old)
+    try:
+        _move(new, folder)
+    except Stop:
+        if old.exists():
+            _move(old, folder)
+        raise
+    return told
+
+
+def uninstall(folder: Path, work: Path, progress) -> int:
+    """Removes the folder, whole or not at all as far as others can see; returns how many bytes it had."""
+    if not folder.exists():
+        return 0
+    progress(0.1, "removing the runtime")
+    count = size(folder)
+    _move(folder, work / "old")
+    shutil.rmtree(work / "old", ignore_errors=True)
+    return count
+
+
+def size(folder: Path) -> int:
+    """Bytes of all files below a folder; links count nothing."""
+    files = (os.path.join(root, name) for root, _, names in os.walk(folder) for name in names)
+    return sum(os.path.getsize(f) for f in files if not os.path.islink(f))
+
+
+def _make_venv(folder: Path) -> list[str]:
+    """Makes a virtual environment; returns the command that is pip for it."""
+    has = [name for name in ("venv", "ensurepip", "pip") if importlib.util.find_spec(name)]
+    if "venv" not in has or len(has) < 2:
+        raise Stop(
+            f"{sys.executable}: this Python comes without venv and ensurepip (Debian and Ubuntu keep them in "
+            f"python3-venv); install them, {ELSEWHERE}."
+        )
+    options = [] if "ensurepip" in has else ["--without-pip"]
+    done = subprocess.run(
+        [sys.executable, "-I", "-m", "venv", *options, str(folder)], env=_env(), capture_output=True, text=True
+    )
+    _log(done.stdout + done.stderr)
+    python = _python_in(folder)
+    if done.returncode or not python.exists():
+        if re.search(NO_ROOM, done.stdout + done.stderr):
+            raise Stop(_no_room(folder))
+        said = [x.strip() for x in (done.stdout + done.stderr).splitlines() if x.strip()]
+        raise Stop(
+            f"{sys.executable}: no virtual environment can be made with this Python "
+            f"({said[-1][:200] if said else 'it does not say why'}); reinstall Blender, {ELSEWHERE}."
+        )
+    if options:
+        return [sys.executable, "-I", "-m", "pip", "--python", str(python)]
+    return [str(python), "-I", "-m", "pip"]
+
+
+def _has_index(pip: list[str]) -> bool:
+    """Whether pip is configured for an index of the user's own, or for none."""
+    done = subprocess.run([*pip, "config", "list"], env=_env(), capture_output=True, text=True)
+    _log(done.stdout + done.stderr)
+    return bool(re.search(r"^[\w:]+\.(index-url|no-index)=", done.stdout.replace("_", "-"), re.MULTILINE))
+
+
+def _install(command: list[str], venv: Path, work: Path, build: str, progress) -> None:
+    """Runs pip; its bar is made of the bytes that lie in its temporary folder and of the packages in place."""
+    _log(" ".join(command))
+    lines: list[str] = []
+    loading, count, total = "packages", 0, 0
+    site = next(iter(venv.glob("lib/python*/site-packages")), venv / "Lib" / "site-packages")
+    before = len(list(site.glob("*.dist-info")))
+    with contextlib.closing(_run(command)) as said:
+        for line in said:
+            if line:
+                _log(line)
+                lines.append(line.strip())
+            if found := re.match(r"\s*(?:Downloading|Processing) (?:\S*/)?([\w.]+)-\S+\.whl", line):
+                loading = found[1]
+            if build == "cpu" and re.match(r"\s*(Collecting|Installing collected packages:.*) (nvidia|cuda)-", line):
+                raise Stop(f"The index that pip is configured for has torch only with CUDA; choose CUDA, {ELSEWHERE}.")
+            if line.startswith("Installing collected packages:"):
+                total = line.count(",") + 1
+            if total:
+                count = min(len(list(site.glob("*.dist-info"))) - before, total)
+                progress(0.7 + 0.3 * count / total, f"installing: {count} of {total} packages")
+            else:
+                got = sum(f.stat().st_size for f in work.glob("pip-*/*.whl"))
+                progress(min(0.7 * got / DOWNLOAD[build], 0.69), f"fetching {loading} ({got / 1e6:.0f} MB so far)")
+    if _child.returncode:
+        raise Stop(_why(lines, work))
+
+
+_child: subprocess.Popen | None = None
+
+
+def _run(command: list[str]) -> Iterator[str]:
+    """The lines that a program prints as they come, and "" every half second without one. It ends with us."""
+    global _child
+    _child = subprocess.Popen(
+        command, env=_env(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        encoding="utf-8", errors="replace",
+    )  # fmt: skip
+    said: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in _child.stdout:
+            said.put(line.rstrip("\n"))
+        said.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    try:
+        while True:
+            try:
+                line = said.get(timeout=0.5)
+            except queue.Empty:
+                yield ""
+                continue
+            if line is None:
+                _child.wait()
+                return
+            yield line
+    finally:
+        if _child.poll() is None:
+            _child.kill()
+        _child.wait()
+
+
+def _why(lines: list[str], work: Path) -> str:
+    """One sentence out of what pip printed before it failed."""
+    text = "\n".join(lines)
+    if re.search(NO_ROOM, text):
+        return _no_room(work)
+    if found := re.search(NETWORK, text):
+        return (
+            f"The package index cannot be reached ({found[0]}); check the network, or pip's configuration if there is "
+            "a mirror or a proxy, and install again."
+        )
+    here = f"Python {sys.version_info.major}.{sys.version_info.minor} on {sysconfig.get_platform()}"
+    if found := re.findall(r"No matching distribution found for ([\w.-]+)", text):
+        return f"The package index has no {found[-1]} for {here}; try another version of Blender, {ELSEWHERE}."
+    errors = [x for x in lines if x.startswith("ERROR:")] or [x for x in lines if x] or ["it said nothing"]
+    return f"pip could not install the packages: {errors[-1].removeprefix('ERROR:').strip()[:300]} (see the log)."
+
+
+def _no_room(folder: Path) -> str:
+    return f"{folder}: the disk is full; make room there and install again."
+
+
+def _prove(python: Path) -> dict[str, str]:
+    """Imports everything in the new environment; returns the versions."""
+    command = [str(python), "-I", "-c", PROOF, json.dumps(NEEDS)]
+    done = subprocess.run(command, env=_env(), capture_output=True, text=True)
+    _log(done.stderr)
+    if done.returncode:
+        last = re.findall(r"^importing (\S+)", done.stderr, re.MULTILINE)
+        said = done.stderr.strip().splitlines()[-1][:300] if done.stderr.strip() else f"code {done.returncode}"
+        raise Stop(f"{last[-1] if last else 'Python'} was installed but does not start here ({said}); {ELSEWHERE[3:]}.")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _move(source: Path, target: Path) -> None:
+    try:
+        os.rename(source, target)
+    except OSError as e:
+        raise Stop(
+            f"{source}: it cannot be moved ({e.strerror or e}); wait until no reconstruction runs, and try again."
+        ) from None
+
+
+def _python_in(venv: Path) -> Path:
+    return venv / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def _env() -> dict[str, str]:
+    """The environment without what would lead Python or pip out of the virtual environment."""
+    out = ("PYTHON", "__PYVENV", "PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PIP_USER", "PIP_PYTHON")
+    return {k: v for k, v in os.environ.items() if not k.startswith(out)} | {"PIP_USER": "0"}
+
+
+def _log(text: str) -> None:
+    if text.strip():
+        print(text.rstrip(), file=sys.stderr, flush=True)
+
+
+def _leave_when_stdin_closes() -> None:
+    with contextlib.suppress(ValueError):
+        while sys.stdin.readline():
+            pass
+    if _child and _child.poll() is None:
+        _child.kill()
+    os._exit(3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
