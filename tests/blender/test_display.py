@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The point cloud and its nodes against numpy; splats against a small ray tracer."""
+
+import math
+
+import numpy as np
+import pytest
+
+from timesplat.datagen.rigs import spherical
+from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
+from timesplat.model.asset import linear_from_srgb, read_ply, rotation_matrices, write_ply
+
+from .helpers import make
+
+EVALUATE = """
+from timesplat.addon import display
+from timesplat.model.asset import read_ply
+bpy.ops.wm.read_factory_settings(use_empty=True)
+asset = read_ply(sys.argv[1])
+ob = display.add_asset(asset, "a", look="Points", cut=0.05)
+scene, out = bpy.context.scene, {}
+def read(data, name, width, key):
+    a = np.empty(len(data.points) * width, np.float32)
+    data.attributes[name].data.foreach_get(key, a)
+    return a.reshape(-1, width).tolist() if width > 1 else a.tolist()
+for look in ("Points", "Splats"):
+    display.set_input(ob.modifiers[0], "Look", display.LOOKS.index(look))
+    for frame in (10.0, 16.25, 21.5, 32.9, 33.0, 2.0, 40.5):
+        scene.frame_set(int(frame), subframe=frame % 1)
+        ev = ob.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        out[f"{look} {frame}"] = {
+            "position": read(ev.data, "position", 3, "vector"),
+            "alpha": read(ev.data, "gs_alpha", 1, "value"),
+            "radius": read(ev.data, "radius", 1, "value"),
+            "color": read(ev.data, "gs_color", 4, "color"),
+            "world": [list(ev.matrix_world @ p.co) for p in ev.data.points][:5],
+            "material": ev.data.materials[0].name if len(ev.data.materials) else "",
+        }
+tell(frames=out, type=ob.type, selected=ob.select_get(), names=[a.name for a in ob.data.attributes],
+     meshes=len(bpy.data.meshes), bounces=scene.cycles.transparent_max_bounces, torch="torch" in sys.modules)
+"""
+
+
+def test_evaluated_attributes_are_those_of_numpy(blender, tmp_path):
+    asset = make()
+    write_ply(tmp_path / "a.ply", asset)
+    asset = read_ply(tmp_path / "a.ply")
+    told = blender(EVALUATE, tmp_path / "a.ply")
+    assert told["type"] == "POINTCLOUD" and told["selected"] and told["meshes"] == 0
+    assert told["bounces"] >= 512 and not told["torch"]
+    expected = {"velocity", "t", "sigma_t", "opacity", "scale", "rotation", "color", "radius", "reach"}
+    assert {f"gs_{x}" for x in expected} <= set(told["names"]) and "velocity" not in told["names"]
+    for key, got in told["frames"].items():
+        look, frame = key.split()
+        position, opacity = asset.at(np.clip(asset.frame_to_time(float(frame)), -1, 1))  # held at the ends
+        seen = opacity >= 0.05
+        assert 20 < seen.sum() < len(asset)
+        np.testing.assert_allclose(got["position"], position[seen], atol=1e-5)
+        np.testing.assert_allclose(got["alpha"], opacity[seen], atol=1e-5)
+        np.testing.assert_allclose(np.array(got["color"])[:, :3], linear_from_srgb(asset.rgb)[seen], atol=1e-6)
+        s = np.sort(asset.soft_scale()[seen], 1)
+        np.testing.assert_allclose(got["radius"], s[:, 1] if look == "Points" else 3 * s[:, 2], rtol=1e-5)
+        np.testing.assert_allclose(got["world"], position[seen][:5] * 2.5 + [1, -2, 3], atol=2e-5)
+
+
+RENDER = """
+from timesplat.addon import display
+display.save_blend(sys.argv[1], sys.argv[2])
+bpy.ops.wm.open_mainfile(filepath=sys.argv[2])
+scene = bpy.context.scene
+ob = next(o for o in bpy.data.objects if o.type == "POINTCLOUD")
+display.set_input(ob.modifiers[0], "Look", 2)
+scene.render.resolution_x = scene.render.resolution_y = 48
+scene.cycles.samples, scene.cycles.filter_width, scene.cycles.use_adaptive_sampling = 32, 0.01, False
+scene.render.film_transparent = True
+scene.frame_set(21, subframe=0.5)
+image = scene.render.image_settings
+image.file_format, image.color_depth = "OPEN_EXR", "32"
+scene.render.filepath = sys.argv[3]
+bpy.ops.render.render(write_still=True)
+tell(range=[scene.frame_start, scene.frame_end], fps=scene.render.fps / scene.render.fps_base,
+     transform=scene.view_settings.view_transform)
+"""
+
+
+def test_splats_are_rendered_as_the_formula_says(blender, tmp_path):
+    """Against a ray tracer of a few lines: linear light, front to back, α exp(-½ d²) along each ray."""
+    OpenEXR = pytest.importorskip("OpenEXR")
+    asset = make(60, seed=3)
+    asset.sigma_t[:] = 1.0
+    asset.scale[:] = np.exp(np.random.default_rng(1).uniform(-4, -1.6, asset.scale.shape))
+    write_ply(tmp_path / "a.ply", asset)
+    told = blender(RENDER, tmp_path / "a.ply", tmp_path / "a.blend", tmp_path / "a.exr")
+    assert told["range"] == [10, 33] and abs(told["fps"] - 23.976) < 1e-4 and told["transform"] == "Standard"
+    with OpenEXR.File(str(tmp_path / "a.exr")) as f:
+        got = f.channels()["RGBA"].pixels
+
+    size, c2w = 48, opengl_to_opencv(spherical(0, 0))
+    position, alpha = (x.astype(float) for x in asset.at(asset.frame_to_time(21.5)))
+    y, x = np.mgrid[:size, :size] + 0.5
+    f = focal_from_fov(50, size)
+    ray = np.stack([(x - size / 2) / f, (y - size / 2) / f, np.ones_like(x)], -1) @ c2w[:3, :3].T
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    scale = asset.soft_scale()
+    reach = 3 * scale.max(1)
+    offset = c2w[:3, 3] - position  # (N,3)
+    M = (rotation_matrices(asset.rotation) / scale[:, None]).transpose(0, 2, 1)
+    w = np.einsum("nij,yxj->nyxi", M, ray)
+    u = np.einsum("nij,nj->ni", M, offset)[:, None, None]
+    d2 = (np.cross(u, w) ** 2).sum(-1) / (w**2).sum(-1)
+    b = np.einsum("ni,yxi->nyx", offset, ray)
+    disc = b**2 - ((offset**2).sum(-1) - reach**2)[:, None, None]  # spheres are met at their front
+    entry = np.where(disc > 0, -b - np.sqrt(np.maximum(disc, 0)), np.inf)
+    a = np.where((disc > 0) & (alpha >= 0.05)[:, None, None], alpha[:, None, None] * np.exp(-0.5 * d2), 0)
+    order = np.argsort(entry, 0)
+    a = np.take_along_axis(a, order, 0)
+    colour = linear_from_srgb(asset.rgb)[order]  # (N,H,W,3)
+    through = np.cumprod(1 - a, 0)
+    weight = a * np.concatenate([np.ones((1, size, size)), through[:-1]])
+    expected = np.concatenate([(weight[..., None] * colour).sum(0), (1 - through[-1])[..., None]], -1)
+    assert expected[..., 3].mean() > 0.15
+    error = np.abs(got - expected)
+    assert error.mean() < 2e-4 and error.max() < 0.03, (error.mean(), error.max())
+
+
+def test_the_clip_is_placed_on_fractional_rates(blender):
+    code = """
+    from timesplat.addon.display import play_clip
+    from timesplat.model.asset import Clip
+    rates = []
+    for fps in (24.0, 23.976, 29.97, 12.5, 0.5, 120.0):
+        play_clip(bpy.context.scene, Clip(fps, 3, 9))
+        rates.append(bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
+    tell(rates=rates)
+    """
+    for rate, fps in zip(blender(code)["rates"], (24.0, 23.976, 29.97, 12.5, 0.5, 120.0), strict=True):
+        assert math.isclose(rate, fps, rel_tol=1e-5)
