@@ -2,6 +2,8 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
+BPY_42 := 4.2.23
+BPY_45 := 4.5.15
 LIBS := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1
 .DEFAULT_GOAL := help
 
@@ -28,10 +30,22 @@ test: $(VENV)/.ready ## all tests, lint included
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m pytest
 
+test-blender: $(VENV)/.ready ## the add-on's tests under BLENDER=/path/to/blender, or a Python that has bpy
+	TIMESPLAT_BLENDER=$(BLENDER) $(BIN)/python -m pytest tests/blender
+
+test-blenders: .venv-bpy42/.ready .venv-bpy45/.ready $(VENV)/.ready ## the add-on's tests under bpy 4.2, 4.5 and 5.0
+	@for v in 42 45; do echo "bpy $$v"; $(MAKE) --no-print-directory test-blender BLENDER=$(CURDIR)/.venv-bpy$$v/bin/python || exit; done
+	@echo "bpy 5.0"; $(MAKE) --no-print-directory test-blender
+
+.venv-bpy%/.ready:
+	$(PYTHON) -m venv .venv-bpy$*
+	.venv-bpy$*/bin/python -m pip install --quiet --disable-pip-version-check bpy==$(BPY_$*) numpy==1.26.4
+	@touch $@
+
 zip: $(VENV)/.ready ## the Blender extension, into dist/
 	$(BIN)/timesplat extension --out dist
 
 clean:           ## what can be made again
-	rm -rf $(VENV) out dist build *.egg-info
+	rm -rf $(VENV) .venv-bpy* out dist build *.egg-info
 
-.PHONY: help setup demo test zip clean
+.PHONY: help setup demo test test-blender test-blenders zip clean
