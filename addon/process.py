@@ -1,135 +1,210 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs `model.worker` under an interpreter that has torch, and reads its answers without ever waiting.
+"""Child processes that answer in JSON lines, read without ever waiting: the worker (`model.worker`) under a Python
+that has torch, and a Blender without a window that renders (`capture`).
 
-torch never comes into Blender's process: the two speak JSON lines through pipes. A thread reads, the caller
-drains a queue. The process and its children die on `kill`, with the add-on, and with Blender itself (the
-worker leaves when its standard input closes).
+torch never comes into Blender's own process. A child gets one JSON object on its standard input and says
+    {"event": "progress", "fraction": 0..1, "text": …}      as often as it likes
+    {"event": "done", …} or {"event": "error", "message": one sentence}     once
+on its standard output; what it writes to standard error is its log. Threads read both, the caller asks `poll`.
+However much a child says, only its last progress, its end and a MOST_LOG of log are kept. The process and its
+children die on `kill`, with the add-on, and with Blender itself (they leave when their standard input closes).
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import importlib.util
 import json
+import math
 import os
 import signal
 import subprocess
-import sys
+import tempfile
 import threading
+import time
 from pathlib import Path
-from queue import Empty, SimpleQueue
 
 from ..datagen.sequence import InputError
 
 PACKAGE = Path(__file__).resolve().parent.parent
-# Imports this folder as the package `timesplat`, whatever the folder is called, and runs its worker. (Its
+# Imports this folder as the package `timesplat`, whatever the folder is called, and runs one module of it. (Its
 # parent stays off the path: other extensions live there, with names that could hide real packages.)
 LAUNCH = """
 import importlib.util, runpy, sys
-folder = sys.argv.pop(1)
-spec = importlib.util.spec_from_file_location("timesplat", folder + "/__init__.py", submodule_search_locations=[folder])
+spec = importlib.util.spec_from_file_location("timesplat", {init!r}, submodule_search_locations=[{folder!r}])
 package = sys.modules["timesplat"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(package)
-runpy.run_module("timesplat.model.worker", run_name="__main__", alter_sys=True)
+sys.argv[1:] = []
+runpy.run_module("timesplat.{module}", run_name="__main__", alter_sys=True)
 """
-_running: set[Worker] = set()
+MOST_LOG = 1 << 20  # bytes of log that are kept in the file; beyond that only the end is remembered
+PIECE = 1 << 16  # longest line that is looked at
+FLOOD = 1 << 20  # bytes between two naps of the reader, so that a child that floods waits, and not Blender
+NAP = 0.02
+_running: set[Child] = set()
 
 
-def find_python(preferred: str = "") -> str:
-    """The interpreter for the worker: `preferred`, else TIMESPLAT_PYTHON, else Blender's own if torch is
-    installed there. Raises InputError where there is none."""
-    for source, path in (
-        ("the preference Python", preferred),
-        ("TIMESPLAT_PYTHON", os.environ.get("TIMESPLAT_PYTHON")),
-    ):
-        if path:
-            if not Path(path).is_file():
-                raise InputError(f"{path}: no such file; correct {source}.")
-            return path
-    if importlib.util.find_spec("torch"):  # looks, does not import
-        return sys.executable
-    raise InputError(
-        "No Python with torch is known: install timesplat[torch] somewhere and name that Python in the add-on's "
-        "preferences or in TIMESPLAT_PYTHON."
-    )
+def launch(module: str) -> str:
+    """Python code that runs `timesplat.<module>` of this very folder."""
+    return LAUNCH.format(init=str(PACKAGE / "__init__.py"), folder=str(PACKAGE), module=module)
 
 
-class Worker:
-    """One request to `model.worker`, started at once. `folder`: an existing folder for its log."""
+def worker(python: str, request: dict, folder: Path) -> Child:
+    """`model.worker` under the interpreter `python`, started at once (the request: see there)."""
+    return Child([python, "-c", launch("model.worker")], request, folder)
 
-    def __init__(self, python: str, request: dict, folder: Path) -> None:
-        self.log = Path(folder) / "worker.log"
-        self._events: SimpleQueue[dict | None] = SimpleQueue()
-        self._ended = False
-        env = {k: v for k, v in os.environ.items() if k != "PYTHONHOME"} | {"PYTHONUNBUFFERED": "1"}
-        group = {"start_new_session": True} if os.name == "posix" else {"creationflags": 0x00000200 | 0x08000000}
+
+def ask(python: str, request: dict) -> dict:
+    """Runs a request to the worker to its end; for tasks of a few seconds. Returns the "done" event; raises
+    InputError with what the worker said."""
+    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+        child = worker(python, request, Path(folder))
         try:
-            with open(self.log, "wb") as log:
-                self.process = subprocess.Popen(
-                    [python, "-c", LAUNCH, str(PACKAGE)],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=log,
-                    cwd=folder,
-                    env=env,
-                    **group,
-                )
+            while True:
+                for event in child.poll(1.0):
+                    if event["event"] == "done":
+                        return event
+                    if event["event"] == "error":
+                        raise InputError(event["message"])
+        finally:
+            child.kill()
+
+
+class Child:
+    """One process, started at once. command: program and arguments; request: what it is asked; folder: an
+    existing folder, where it runs, keeps temporary files and has its log (several may follow each other in it).
+    Raises InputError where it cannot be started."""
+
+    def __init__(self, command: list[str], request: dict, folder: Path) -> None:
+        self.log = Path(folder) / "log.txt"
+        self._news = threading.Condition()
+        self._progress: dict | None = None
+        self._end: dict | None = None
+        self._told = False
+        self._tail = b""
+        env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
+        env |= {"PYTHONUNBUFFERED": "1", **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))}
+        group = {"start_new_session": True} if os.name == "posix" else {"creationflags": 0x00000200 | 0x08000000}
+        pipe = subprocess.PIPE
+        try:
+            self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=folder, env=env, **group)
         except OSError as e:
-            raise InputError(f"{python}: it cannot be started ({e.strerror or e}); choose another Python.") from None
+            reason = e.strerror or e
+            raise InputError(f"{command[0]}: it cannot be started ({reason}); choose another program.") from None
         _running.add(self)
         with contextlib.suppress(OSError):  # it may be gone already; then the log says why
             self.process.stdin.write((json.dumps({**request, "watch": True}) + "\n").encode())
             self.process.stdin.flush()  # and it stays open: its end is the sign that Blender is gone
+        self._logger = threading.Thread(target=self._keep_log, daemon=True)
+        self._logger.start()
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        for line in self.process.stdout:
-            try:
-                event = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(event, dict) and "event" in event:
-                self._events.put(event)
+        for line in _pieces(self.process.stdout):
+            event = _event(line)
+            with self._news:
+                if event and self._end is None:
+                    if event["event"] == "progress":
+                        self._progress = event
+                    else:
+                        self._end = event
+                    self._news.notify_all()
         self.process.wait()
-        self._events.put(None)
+        self._logger.join(2.0)  # a grandchild may hold the pipe
+        with self._news:
+            self._end = self._end or {"event": "error", "message": self._last_words()}
+            self._news.notify_all()
+        _running.discard(self)
+
+    def _keep_log(self) -> None:
+        written = 0
+        try:
+            with open(self.log, "ab", buffering=0) as log:
+                for line in _pieces(self.process.stderr):
+                    self._tail = (self._tail + line)[-PIECE:]
+                    if written <= MOST_LOG:
+                        with contextlib.suppress(OSError):  # the disk may be full; the tail is in memory
+                            log.write(line)
+                        written += len(line)
+        except OSError:
+            for line in _pieces(self.process.stderr):
+                self._tail = (self._tail + line)[-PIECE:]
 
     def poll(self, timeout: float | None = None) -> list[dict]:
-        """The events since the last call, waiting up to `timeout` seconds for the first. A process that ends
-        without "done" or "error" gives an "error" with the last line of its log."""
-        events: list[dict] = []
-        with contextlib.suppress(Empty):
-            while not self._ended:
-                event = self._events.get(block=timeout is not None and not events, timeout=timeout)
-                if event is None:
-                    _running.discard(self)
-                    event = {"event": "error", "message": self._last_words()}
-                self._ended = event["event"] in ("done", "error")
-                events.append(event)
-        return events
+        """What is new since the last call: the last progress, and the end ("done" or "error") once; waits up to
+        `timeout` seconds for the first news. A process that leaves without an end gives an "error" with the last
+        line of its log."""
+        with self._news:
+            if timeout:
+                self._news.wait_for(lambda: self._progress or (self._end and not self._told), timeout)
+            news = [self._progress] if self._progress else []
+            if self._end and not self._told:
+                news.append(self._end)
+                self._told = True
+            self._progress = None
+        return news
+
+    def log_text(self) -> str:
+        """The log: its beginning from the file and, where more was said than that keeps, its end."""
+        try:
+            head = self.log.read_bytes()
+        except OSError:
+            head = b""
+        tail = self._tail
+        whole = head if head.endswith(tail) else head + b"\n[...]\n" + tail
+        return whole.decode("utf-8", "replace")
 
     def _last_words(self) -> str:
-        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.is_file() else []
-        said = lines[-1].strip()[:300] if lines else "it said nothing"
-        return f"The worker process ended with code {self.process.returncode}: {said}"
+        code = self.process.returncode
+        said = [x.strip() for x in self._tail.decode("utf-8", "replace").splitlines() if x.strip()]
+        how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        return f"The process {how}: {said[-1][:300] if said else 'it said nothing'}"
 
     def kill(self) -> None:
         """Ends the process and its children, now. Harmless when it has ended."""
         _running.discard(self)
-        if self.process.poll() is None:
-            if os.name == "posix":
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(self.process.pid, signal.SIGKILL)
-            else:
-                subprocess.run(["taskkill", "/F", "/T", "/PID", str(self.process.pid)], capture_output=True)
+        if os.name == "posix":
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.process.pid, signal.SIGKILL)  # what it started goes too, even after its own end
+        elif self.process.poll() is None:
+            subprocess.run(["taskkill", "/F", "/T", "/PID", str(self.process.pid)], capture_output=True)
         self.process.wait()
         with contextlib.suppress(OSError):
             self.process.stdin.close()
 
 
+def _pieces(pipe):
+    """Lines of a pipe, cut where they are longer than PIECE; with naps where they come too fast."""
+    count = 0
+    while line := pipe.readline(PIECE):
+        yield line
+        count += len(line)
+        if count > FLOOD:
+            count = 0
+            time.sleep(NAP)
+
+
+def _event(line: bytes) -> dict | None:
+    """An event as the protocol has it, its fraction within 0..1 and its texts short; None for anything else."""
+    if not line.startswith(b"{"):
+        return None
+    try:
+        event = json.loads(line)
+        kind = event["event"]
+        if kind == "progress":
+            fraction = float(event.get("fraction", 0))
+            event["fraction"] = min(max(fraction, 0.0), 1.0) if math.isfinite(fraction) else 0.0
+            event["text"] = str(event.get("text", ""))[:200]
+        if kind == "error":
+            event["message"] = str(event.get("message", "it does not say why"))[:2000]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return event if kind in ("progress", "done", "error") else None
+
+
 def kill_all() -> None:
-    for worker in list(_running):
-        worker.kill()
+    for child in list(_running):
+        child.kill()
 
 
 atexit.register(kill_all)

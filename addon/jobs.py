@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What runs beside Blender: Jobs, each a chain of child processes, their progress, their end and their logs.
+
+A Job lives in Python and in a folder of its own, not in the .blend: undo, saving and opening another file do not
+touch it. A timer looks after all of them. What a Job brings back it hands to `finish` on the main thread: at once
+where nothing else is under way, otherwise the Job waits, and a click brings it in. Whatever happens, a Job that has
+ended leaves neither a process nor a file behind.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import itertools
+import os
+import shutil
+import tempfile
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+from bpy.app.handlers import persistent
+from bpy.props import IntProperty
+
+from ..datagen.sequence import InputError
+from . import process
+from .preferences import user_folder
+
+INTERVAL = 0.25  # seconds between two looks
+KEPT = 8  # Jobs that are listed; older ones that have ended are forgotten
+JOBS: list[Job] = []
+_numbers = itertools.count(1)
+_session = 0  # counts the files that were opened
+ICONS = {"running": "SORTTIME", "waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
+
+
+class Job:
+    """state: running, waiting (for `bring`), done, failed or cancelled; fraction 0..1 and text: how far it is;
+    message: how it ended."""
+
+    def __init__(self, label: str, stages: list, finish, shares, scene: str | None) -> None:
+        self.label, self.number, self.session, self.scene = label, next(_numbers), _session, scene
+        self.state, self.fraction, self.text, self.message = "running", 0.0, "starting", ""
+        self._stages, self._finish = list(stages), finish
+        self._shares = list(shares or [1 / len(stages)] * len(stages))
+        self._before, self._log, self._event = 0.0, "", {}
+        self.folder = Path(tempfile.mkdtemp(prefix=f"run-{os.getpid()}-", dir=user_folder("runs")))
+        self.child: process.Child | None = None
+        try:
+            self._next()
+        except BaseException:
+            self._end("failed", "")
+            raise
+
+    def _next(self) -> None:
+        self.child = self._stages.pop(0)(self.folder)
+
+    def step(self, timeout: float | None = None) -> bool:
+        """Takes in what the processes said, starts the next; True where something changed."""
+        if self.state != "running":
+            return False
+        events = self.child.poll(timeout)
+        for event in events:
+            share = self._shares[0]
+            if event["event"] == "progress":
+                self.fraction, self.text = self._before + share * event["fraction"], event["text"]
+            elif event["event"] == "error":
+                self._end("failed", event["message"])
+            else:
+                self._before += self._shares.pop(0)
+                self.fraction = self._before
+                self.child.kill()  # it has said all; what it leaves running goes too
+                if self._stages:
+                    try:
+                        self._next()
+                    except InputError as e:
+                        self._end("failed", str(e))
+                else:
+                    self._event, self.state, self.text = event, "waiting", "done"
+        return bool(events)
+
+    def bring(self) -> None:
+        """Hands the result over, in Object Mode; the Job is done then, or has failed."""
+        try:
+            message = self._finish(self._event, self.folder) if self._finish else self.label
+        except InputError as e:
+            self._end("failed", str(e))
+        except Exception as e:
+            self._log += traceback.format_exc()
+            self._end(
+                "failed", f"The result cannot be brought in: {type(e).__name__}: {' '.join(str(e).split())[:300]}"
+            )
+        else:
+            self._end("done", message)
+
+    def cancel(self) -> None:
+        """Ends it, now; harmless where it has ended."""
+        if self.state in ("running", "waiting"):
+            self._end("cancelled", "Cancelled.")
+
+    def _end(self, state: str, message: str) -> None:
+        if self.child:
+            self.child.kill()
+        self._log = self.log_text()
+        self.child, self.state, self.message, self.text = None, state, message, ""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def log_text(self) -> str:
+        """All that its processes wrote, or the beginning and the end of it."""
+        return self._log + (self.child.log_text() if self.child else "")
+
+
+def start(
+    label: str, stages: list[Callable[[Path], process.Child]], finish=None, shares=None, scene: str | None = None
+) -> Job:
+    """Starts a Job: `stages` run one after another, each is called with the Job's folder and starts a process;
+    `shares` are their parts of the progress (default: equal ones). `finish(event, folder)` gets the last stage's
+    "done" event and returns the message to show; where `scene` is named it brings something into this scene, and
+    is called when that can be done. Raises InputError where the first cannot be started."""
+    sweep()
+    try:
+        job = Job(label, stages, finish, shares, scene)
+    except OSError as e:
+        raise InputError(f"{user_folder('runs')}: it cannot be written ({e.strerror or e}); make room there.") from None
+    ended = [j for j in JOBS if j.state not in ("running", "waiting")]
+    for old in ended[: max(0, len(JOBS) - KEPT + 1)]:
+        JOBS.remove(old)
+    JOBS.append(job)
+    if not bpy.app.background and not bpy.app.timers.is_registered(_look):
+        bpy.app.timers.register(_look, first_interval=INTERVAL, persistent=True)
+    return job
+
+
+def wait(job: Job) -> None:
+    """Stays with the Job until it has ended, for scripts and `blender -b`. Raises InputError if it failed."""
+    try:
+        while job.state == "running":
+            job.step(INTERVAL)
+        if job.state == "waiting":
+            job.bring()
+    finally:
+        job.cancel()
+    if job.state != "done":
+        raise InputError(job.message)
+
+
+def running() -> list[Job]:
+    """The Jobs whose processes run."""
+    return [job for job in JOBS if job.state == "running"]
+
+
+def _look():
+    """The timer: every Job once."""
+    changed = [job for job in JOBS if job.step()]
+    for job in JOBS:
+        if job.state == "waiting" and _quiet(job):
+            window = bpy.context.window_manager.windows[0]
+            with bpy.context.temp_override(window=window):
+                job.bring()
+                if job.scene:
+                    bpy.ops.ed.undo_push(message=job.label)
+            changed.append(job)
+    if changed:
+        _redraw(changed[-1])
+    return INTERVAL if any(job.state in ("running", "waiting") for job in JOBS) else None
+
+
+def _quiet(job: Job) -> bool:
+    """Whether the result may come in by itself: the same file and scene, Object Mode, no tool in the artist's hand."""
+    if not job.scene:
+        return True
+    windows = bpy.context.window_manager.windows
+    if job.session != _session or not windows or windows[0].scene.name != job.scene:
+        return False
+    with bpy.context.temp_override(window=windows[0]):
+        return bpy.context.mode == "OBJECT" and not any(len(w.modal_operators) for w in windows)
+
+
+def _redraw(job: Job) -> None:
+    text = f"Timesplat: {job.text}, {job.fraction:.0%} (Esc over a 3D view cancels)"
+    for window in bpy.context.window_manager.windows:
+        window.workspace.status_text_set(text if running() else None)
+        for area in window.screen.areas:
+            if area.type in ("VIEW_3D", "PREFERENCES", "PROPERTIES"):
+                area.tag_redraw()
+
+
+def sweep() -> None:
+    """Removes what Blenders that are gone left in the folder of runs."""
+    for folder in user_folder("runs").glob("run-*-*"):
+        with contextlib.suppress(ValueError):
+            if not _alive(int(folder.name.split("-")[1])):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _alive(pid: int) -> bool:
+    if os.name != "posix":
+        return pid == os.getpid()  # files of a running Blender cannot be removed there
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+# ---------------------------------------------------------------- operators
+
+
+class _OfJob:
+    number: IntProperty(description="The Job's number; 0: the newest", min=0, options={"SKIP_SAVE"})
+
+    def job(self) -> Job | None:
+        return next((j for j in reversed(JOBS) if self.number in (0, j.number)), None)
+
+
+class TIMESPLAT_OT_cancel(_OfJob, bpy.types.Operator):
+    """End what runs, or throw away what waits; the scene is as it was"""
+
+    bl_idname = "timesplat.cancel"
+    bl_label = "Cancel Reconstruction"
+
+    @classmethod
+    def poll(cls, context):
+        return any(job.state in ("running", "waiting") for job in JOBS)
+
+    def invoke(self, context, event):
+        if event.type == "ESC" and (not running() or context.screen.is_animation_playing):
+            return {"PASS_THROUGH"}  # Esc means something else then
+        return self.execute(context)
+
+    def execute(self, context):
+        job = self.job() if self.number else (running() or JOBS)[-1]
+        if job:
+            job.cancel()
+            _redraw(job)
+            self.report({"INFO"}, f"{job.label}: cancelled.")
+        return {"FINISHED"}
+
+
+class TIMESPLAT_OT_bring(_OfJob, bpy.types.Operator):
+    """Bring the result into this scene"""
+
+    bl_idname = "timesplat.bring"
+    bl_label = "Bring In Result"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    @classmethod
+    def poll(cls, context):
+        return context.mode == "OBJECT" and any(job.state == "waiting" for job in JOBS)
+
+    def execute(self, context):
+        job = self.job()
+        if job and job.state == "waiting":
+            job.bring()
+            self.report({"INFO"} if job.state == "done" else {"ERROR"}, job.message)
+        return {"FINISHED"}
+
+
+class TIMESPLAT_OT_log(_OfJob, bpy.types.Operator):
+    """Show the log as a text, in a window of its own"""
+
+    bl_idname = "timesplat.log"
+    bl_label = "Show Log"
+
+    @classmethod
+    def poll(cls, context):
+        return bool(JOBS)
+
+    def execute(self, context):
+        job = self.job()
+        if not job:
+            return {"CANCELLED"}
+        text = bpy.data.texts.get("Timesplat log") or bpy.data.texts.new("Timesplat log")
+        text.from_string(f"{job.label}: {job.message or job.text}\n\n{job.log_text() or 'It said nothing.'}")
+        if not bpy.app.background:
+            show_text(context, text)
+        return {"FINISHED"}
+
+
+def show_text(context, text) -> None:
+    """Opens a text in a window of its own."""
+    bpy.ops.wm.window_new()
+    area = context.window_manager.windows[-1].screen.areas[0]
+    area.type = "TEXT_EDITOR"
+    area.spaces.active.text = text
+
+
+def draw(layout) -> None:
+    """One row a Job, the newest first."""
+    for job in reversed(JOBS):
+        box = layout.column(align=True)
+        row = box.row(align=True)
+        if job.state == "running":
+            row.progress(factor=job.fraction, text=f"{job.label}: {job.text}")
+        else:
+            row.label(text=f"{job.label}: {job.message or job.text}", icon=ICONS[job.state])
+        if job.state == "waiting":
+            row.operator("timesplat.bring", text="", icon="IMPORT").number = job.number
+        row.operator("timesplat.log", text="", icon="TEXT").number = job.number
+        if job.state in ("running", "waiting"):
+            row.operator("timesplat.cancel", text="", icon="X").number = job.number
+        elif job.state == "failed" and len(job.message) > 40:
+            for line in _lines(job.message):
+                box.label(text=line)
+
+
+def _lines(message: str, width: int = 44) -> list[str]:
+    import textwrap
+
+    return textwrap.wrap(message, width)
+
+
+# ---------------------------------------------------------------- with Blender
+
+
+@persistent
+def _opened(*_) -> None:
+    global _session
+    _session += 1
+
+
+def close() -> None:
+    """Ends all Jobs."""
+    for job in JOBS:
+        job.cancel()
+    JOBS.clear()
+
+
+atexit.register(close)
+CLASSES = (TIMESPLAT_OT_cancel, TIMESPLAT_OT_bring, TIMESPLAT_OT_log)
+_keys: list = []
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.app.handlers.load_post.append(_opened)
+    if keys := bpy.context.window_manager.keyconfigs.addon:  # none in background
+        keymap = keys.keymaps.new(name="3D View", space_type="VIEW_3D")
+        _keys.append((keymap, keymap.keymap_items.new("timesplat.cancel", "ESC", "PRESS")))
+
+
+def unregister() -> None:
+    close()
+    process.kill_all()
+    if bpy.app.timers.is_registered(_look):
+        bpy.app.timers.unregister(_look)
+    for keymap, item in _keys:
+        keymap.keymap_items.remove(item)
+    _keys.clear()
+    bpy.app.handlers.load_post.remove(_opened)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

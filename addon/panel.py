@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The Timesplat tab in the 3D view's sidebar: what to capture, with which cameras, how to reconstruct it, what is
+under way. Drawing reads settings and nothing else: no file, no evaluated object."""
+
+import bpy
+from bl_operators.presets import AddPresetBase
+from bl_ui.utils import PresetPanel
+from bpy.props import EnumProperty
+
+from ..datagen.sequence import InputError
+from . import jobs, preferences, rigs, settings
+
+PRESETS = {  # what they differ in
+    "DRAFT": {"size": 64, "samples": 8, "method": "lift", "budget": "ALL", "refine": 0.0},
+    "BALANCED": {"size": 128, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 5.0},
+    "FINE": {"size": 256, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 30.0},
+}
+PRESET_ITEMS = [
+    ("DRAFT", "Draft", "In a few seconds: small pictures, no network"),
+    ("BALANCED", "Balanced", "The best of a quarter of a minute"),
+    ("FINE", "Fine", "Larger pictures, a longer fit"),
+]
+
+
+class TIMESPLAT_OT_preset(bpy.types.Operator):
+    """Choose resolution, samples, method, refinement and number of Gaussians at once"""
+
+    bl_idname = "timesplat.preset"
+    bl_label = "Timesplat Preset"
+    bl_options = {"UNDO"}  # noqa: RUF012
+
+    preset: EnumProperty(name="Preset", items=PRESET_ITEMS)
+
+    def execute(self, context):
+        for key, value in PRESETS[self.preset].items():
+            setattr(context.scene.timesplat, key, value)
+        return {"FINISHED"}
+
+
+class TIMESPLAT_OT_preset_add(AddPresetBase, bpy.types.Operator):
+    """Add or remove a preset of your own"""
+
+    bl_idname = "timesplat.preset_add"
+    bl_label = "Add Timesplat Preset"
+    preset_menu = "TIMESPLAT_PT_presets"
+    preset_subdir = "timesplat"
+    preset_defines = ("settings = bpy.context.scene.timesplat",)
+    preset_values = tuple(f"settings.{k}" for k in settings.KEYS if k not in ("collection", "output"))
+
+
+class TIMESPLAT_PT_presets(PresetPanel, bpy.types.Panel):
+    bl_label = "Timesplat Presets"
+    preset_subdir = "timesplat"
+    preset_operator = "script.execute_preset"
+    preset_add_operator = "timesplat.preset_add"
+
+
+class _Sidebar:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Timesplat"
+
+
+class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
+    bl_label = "Timesplat"
+    bl_order = 0
+
+    def draw_header_preset(self, context):
+        TIMESPLAT_PT_presets.draw_panel_header(self.layout)
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        row = layout.row(align=True)
+        for key, name, _ in PRESET_ITEMS:
+            row.operator("timesplat.preset", text=name).preset = key
+        col = layout.column(align=True)
+        try:
+            expected = settings.estimate(chosen, context)
+        except InputError as e:
+            col.label(text=str(e), icon="ERROR")
+        else:
+            seconds = expected.rendering + expected.reconstructing
+            row = col.row(align=True)
+            row.label(text=f"{expected.pictures} pictures", icon="RENDER_RESULT")
+            row.label(text=f"about {_duration(seconds)}", icon="TIME")
+            col.label(text=f"about {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
+        row = layout.row()
+        row.scale_y = 1.5
+        operator = row.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
+        for key in settings.KEYS:
+            setattr(operator, key, getattr(chosen, key))
+        jobs.draw(layout)
+        layout.operator("timesplat.import_asset", icon="IMPORT")
+
+
+class TIMESPLAT_PT_capture(_Sidebar, bpy.types.Panel):
+    bl_label = "Capture"
+    bl_parent_id = "TIMESPLAT_PT_panel"
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        layout.use_property_split, layout.use_property_decorate = True, False
+        layout.prop(chosen, "source")
+        if chosen.source == "COLLECTION":
+            layout.prop_search(chosen, "collection", bpy.data, "collections", text=" ")
+        layout.prop(chosen, "frame_range")
+        col = layout.column(align=True)
+        if chosen.frame_range == "CUSTOM":
+            col.prop(chosen, "frame_start")
+            col.prop(chosen, "frame_end")
+        col.prop(chosen, "every")
+        col = layout.column(align=True)
+        col.prop(chosen, "size")
+        col.prop(chosen, "samples")
+        layout.prop(chosen, "lighting")
+
+
+class TIMESPLAT_PT_cameras(_Sidebar, bpy.types.Panel):
+    bl_label = "Cameras"
+    bl_parent_id = "TIMESPLAT_PT_panel"
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        placed, said = settings.cameras(context)
+        layout.label(text=said, icon="OUTLINER_OB_CAMERA")
+        if placed:
+            layout.prop(chosen, "in_turn")
+        grid = layout.grid_flow(columns=2, align=True, even_columns=True)
+        for key, name, _ in rigs.RIGS:
+            grid.operator("timesplat.add_cameras", text=name).rig = key
+
+
+class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
+    bl_label = "Model"
+    bl_parent_id = "TIMESPLAT_PT_panel"
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        layout.use_property_split, layout.use_property_decorate = True, False
+        layout.prop(chosen, "method")
+        layout.prop(chosen, "refine")
+        layout.prop(chosen, "budget")
+        if chosen.budget in ("SHARE", "NUMBER"):
+            layout.prop(chosen, chosen.budget.lower(), text=" ")
+        layout.prop(chosen, "look")
+        layout.prop(chosen, "output")
+        if mine := preferences.get(context):
+            layout.prop(mine, "checkpoint")
+            layout.prop(mine, "device")
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def _round(count: int) -> int:
+    """Two digits of it: more are not known."""
+    return round(count, 2 - len(str(count)))
+
+
+CLASSES = (
+    TIMESPLAT_OT_preset,
+    TIMESPLAT_OT_preset_add,
+    TIMESPLAT_PT_presets,
+    TIMESPLAT_PT_panel,
+    TIMESPLAT_PT_capture,
+    TIMESPLAT_PT_cameras,
+    TIMESPLAT_PT_model,
+)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

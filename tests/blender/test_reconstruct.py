@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reconstruct: what is captured, in background from end to end, and what can go wrong on the way."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from timesplat.model.asset import read_ply
+
+ANIMATE = """
+import time
+for o in list(bpy.data.objects):
+    bpy.data.objects.remove(o)
+for c in list(bpy.data.cameras):
+    bpy.data.cameras.remove(c)
+scene = bpy.context.scene
+scene.frame_start, scene.frame_end, scene.render.fps = 5, 19, 30
+bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5)
+ball = bpy.context.object
+for frame, x in ((5, 1.0), (19, 3.0)):
+    ball.location = (x, 2, 3)
+    ball.keyframe_insert("location", frame=frame)
+for i in ball.animation_data.action.fcurves if hasattr(ball.animation_data.action, "fcurves") else \
+        ball.animation_data.action.layers[0].strips[0].channelbags[0].fcurves:
+    for k in i.keyframe_points:
+        k.interpolation = "LINEAR"
+scene.frame_set(9)
+runs = bpy.utils.extension_path_user(name, path="runs", create=True)
+QUICK = dict(method="lift", budget="ALL", refine=0, samples=2)
+"""
+RECONSTRUCT = """
+scene.render.resolution_x, scene.cycles.samples = 333, 77
+ball.rotation_euler.x = 0.5  # changed and not keyed
+before = [len(bpy.data.objects), len(bpy.data.scenes), len(bpy.data.cameras), len(bpy.data.worlds)]
+done = bpy.ops.timesplat.reconstruct(method="lift", every=2, size=48, samples=4, output=sys.argv[1], budget="ALL",
+                                     refine=0)
+ob = bpy.context.object
+same = [scene.frame_current == 9, scene.render.resolution_x == 333, scene.cycles.samples == 77,
+        abs(ball.rotation_euler.x - 0.5) < 1e-6, bpy.data.filepath == ""]
+result = {}
+for frame in (5, 12.5, 19):
+    scene.frame_set(int(frame), subframe=frame % 1)
+    ev = ob.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    points = np.array([ev.matrix_world @ p.co for p in ev.data.points])
+    radius = np.linalg.norm(points - np.array(ball.matrix_world.translation), axis=1)
+    result[frame] = [points.mean(0).tolist(), float(np.median(radius))]
+after = [len(bpy.data.objects), len(bpy.data.scenes), len(bpy.data.cameras), len(bpy.data.worlds)]
+camera = bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye"))
+scene.collection.objects.link(camera)
+camera.location, camera.rotation_euler = (2, -1, 3), (np.pi / 2, 0, 0)
+bpy.ops.object.select_all(action="DESELECT")
+camera.select_set(True)
+second = bpy.ops.timesplat.reconstruct(method="rgb", every=5, size=32, samples=2, budget="NUMBER", number=50,
+                                       refine=0.5)
+count = len(bpy.context.object.data.points if hasattr(bpy.context.object.data, "points") else
+            bpy.context.object.data.vertices)
+tell(done=list(done), second=list(second), frames=result, before=before, after=after, left=os.listdir(runs),
+     same=same, torch="torch" in sys.modules, source=list(ob["timesplat_source"]), count=count)
+"""
+
+
+def test_a_ball_on_a_line(installed, tmp_path):
+    """Captured, lifted in a worker and back over the original; nothing else of the scene has changed."""
+    pytest.importorskip("torch")
+    told = installed(ANIMATE + RECONSTRUCT, tmp_path / "kept.ply")
+    assert told["done"] == told["second"] == ["FINISHED"] and not told["torch"]
+    for frame, x in (("5", 1), ("12.5", 15 / 7), ("19", 3)):
+        mean, radius = told["frames"][frame]
+        np.testing.assert_allclose(mean, [x, 2, 3], atol=0.25)
+        assert abs(radius - 0.5) < 0.12  # eight pictures of 48 pixels
+    objects, *others = told["before"]
+    assert told["after"] == [objects + 1, *others] and told["left"] == [] and all(told["same"]), told
+    assert told["source"] == ["Sphere"] and 1 <= told["count"] <= 50
+    kept = read_ply(tmp_path / "kept.ply")
+    assert (kept.clip.frame_start, kept.clip.frame_end, kept.clip.fps) == (5, 19, 30)
+    assert abs(kept.clip.scale - 1.5) < 0.01
+
+
+REFUSED = """
+jobs = part("addon.jobs")
+errors = {}
+def refused(key, **options):
+    try:
+        bpy.ops.timesplat.reconstruct(size=32, every=8, **QUICK, **options)
+        errors[key] = "accepted"
+    except RuntimeError as e:
+        errors[key] = str(e).strip()
+bpy.ops.object.camera_add()
+camera = bpy.context.object
+camera.data.type = "ORTHO"
+refused("ortho")
+camera.data.type = "PERSP"
+refused("nothing", source="SELECTED")
+refused("collection", source="COLLECTION", collection="Cellar")
+refused("range", frame_range="CUSTOM", frame_start=5, frame_end=2)
+refused("folder", output="/nowhere/a.ply")
+refused("suffix", output="/a.obj")
+refused("checkpoint", checkpoint="/nowhere/a.safetensors")
+camera.select_set(False)
+ball.hide_render = True
+refused("hidden")
+ball.hide_render = False
+os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
+refused("python")
+os.environ["TIMESPLAT_PYTHON"] = "/bin/false"
+refused("dies")
+os.environ["TIMESPLAT_PYTHON"] = "/bin/sh"
+open(sys.argv[1], "w").write("not weights")
+tell(errors=errors, left=os.listdir(runs), states=[j.state for j in jobs.JOBS], frame=scene.frame_current,
+     scenes=len(bpy.data.scenes), clouds=sum("timesplat" in o for o in bpy.data.objects))
+"""
+SAID = {
+    "ortho": "perspective",
+    "nothing": "nothing to capture",
+    "collection": "no such collection",
+    "range": "empty",
+    "folder": "no such folder",
+    "suffix": "must end in .ply",
+    "checkpoint": "no such checkpoint",
+    "hidden": "no mesh is visible",
+    "python": "no such file",
+    "dies": "code 1",
+}
+
+
+def test_what_cannot_be_done_is_said(installed, tmp_path):
+    told = installed(ANIMATE + REFUSED, tmp_path / "bad.safetensors")
+    for key, word in SAID.items():
+        said = told["errors"][key]
+        assert word in said and "Traceback" not in said and "\n" not in said, (key, said)
+    assert told["left"] == [] and told["scenes"] == 1 and told["clouds"] == 0 and told["frame"] == 9
+
+
+SELECT = """
+part("addon").register()
+settings = part("addon.settings")
+scene, chosen = bpy.context.scene, bpy.context.scene.timesplat
+ranges = [[settings.spread(1, e, n) for n in (1, 2, 8, 24)] for e in (1, 2, 24, 40, 250)]
+names = lambda: sorted(o.name for o in settings.objects(chosen, bpy.context))
+everything = names()
+bpy.ops.mesh.primitive_cube_add()
+cube = bpy.context.object
+cube.name = "Child"
+bpy.ops.object.empty_add()
+empty = bpy.context.object
+cube.parent = empty
+bpy.ops.mesh.primitive_cube_add()
+asset = bpy.context.object
+asset.name, asset["timesplat"] = "Asset", 1
+bpy.ops.object.select_all(action="DESELECT")
+empty.select_set(True)
+chosen.source = "SELECTED"
+selected = names()
+group = bpy.data.collections.new("Group")
+scene.collection.children.link(group)
+group.objects.link(cube)
+chosen.source, chosen.collection = "COLLECTION", "Group"
+collected = names()
+chosen.every = 7
+own = settings.frames(chosen, scene)
+said = [settings.cameras(bpy.context)[1]]
+chosen.source = "SCENE"
+bpy.ops.timesplat.add_cameras(rig="ORBIT", count=5)
+estimates = []
+for every, turn in ((7, False), (7, True)):
+    chosen.every, chosen.in_turn = every, turn
+    estimates.append(settings.estimate(chosen, bpy.context).pictures)
+said.append(settings.cameras(bpy.context)[1])
+bpy.ops.object.select_all(action="DESELECT")
+said.append(settings.cameras(bpy.context)[1])
+bpy.data.objects["Camera"].select_set(True)
+said.append(settings.cameras(bpy.context)[1])
+tell(ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
+     estimates=estimates)
+"""
+
+
+def test_what_the_settings_select(blender):
+    told = blender(SELECT)
+    for row, end in zip(told["ranges"], (1, 2, 24, 40, 250), strict=True):
+        for frames, count in zip(row, (1, 2, 8, 24), strict=True):
+            steps = {b - a for a, b in pairwise(frames)}
+            assert frames[0] == 1 and len(frames) <= count and len(steps) <= 1
+            if count > 1:
+                assert frames[-1] <= end < frames[-1] + max([1, *steps])
+    assert told["everything"] == ["Camera", "Cube", "Light"]
+    assert told["selected"] == ["Child", "Empty", "Light"] and told["collected"] == ["Child", "Light"]
+    assert told["own"] == [*range(1, 251, 7)] and told["estimates"] == [5 * 36, 36]
+    assert told["said"] == [
+        "Front, left, back, right in turn", "5 selected cameras", "5 cameras of the rig", "1 selected camera",
+    ]  # fmt: skip
