@@ -1,32 +1,79 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""File > Import > 4D Gaussians (.ply), also by dropping a file on the viewport and headless:
-`bpy.ops.timesplat.import_ply(filepath=…)`."""
+"""File > Import > 4D Gaussians, also by dropping files on a 3D view, and headless:
 
+    bpy.ops.timesplat.import_asset(filepath="a.ply")                                  or .splat, .spz, .usd*
+    bpy.ops.timesplat.import_asset(filepath="folder/")                                its .ply files, one a frame
+    bpy.ops.timesplat.import_asset(directory="folder", files=[{"name": "a.ply"}, …])  these, one a frame
+
+USD is read with the pxr of this Python, or by the worker in Blenders that have none.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import tempfile
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..datagen.sequence import InputError
+from ..model import formats, usd
 from ..model.asset import VISIBLE, read_ply
-from . import display
+from . import display, preferences, process
 
 LOOK_ITEMS = [
     ("Automatic", "Automatic", "Points in the viewport, Splats in renders"),
     ("Points", "Points", "Opaque dots: fast"),
     ("Splats", "Splats", "Soft ellipsoids, as the asset was fitted: slower"),
 ]
+UP_ITEMS = [
+    ("AUTO", "Automatic", "Z in Timesplat's own files, Y in .spz, -Y in other .ply and .splat, as 3DGS has it"),
+    ("Z", "Z", "As in Blender: nothing is turned"),
+    ("Y", "Y", "As in glTF and .spz"),
+    ("-Y", "-Y", "As in 3D Gaussian Splatting and other photogrammetry"),
+]
+TURNS = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # about X
+SUFFIXES = (*formats.SUFFIXES, *usd.SUFFIXES)
 
 
-class TIMESPLAT_OT_import_ply(bpy.types.Operator):
-    """Import a 3D or 4D Gaussian splat file as a point cloud that plays with the timeline"""
+def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> formats.Loaded:
+    """One asset from a file of any kind, or from several that are one frame each. Raises InputError."""
+    if not any(p.suffix.lower() in usd.SUFFIXES for p in paths):
+        return formats.read_sequence(paths, fps=fps, frame_start=frame_start)
+    if len(paths) > 1:
+        raise InputError("USD files hold their frames themselves; import them one by one.")
+    (path,) = paths
+    if importlib.util.find_spec("pxr"):
+        return formats.Loaded(usd.read_usd(path), "Z")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the name.")
+    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+        copy = Path(folder) / "asset.ply"
+        request = {"task": "import", "source": str(path.resolve()), "asset": str(copy)}
+        process.ask(preferences.worker_python(context), request)
+        return formats.Loaded(read_ply(copy), "Z")
 
-    bl_idname = "timesplat.import_ply"
+
+class TIMESPLAT_OT_import_asset(bpy.types.Operator):
+    """Import a 3D or 4D Gaussian splat file, or a sequence of them, as a point cloud that plays with the timeline"""
+
+    bl_idname = "timesplat.import_asset"
     bl_label = "Import 4D Gaussians"
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    filepath: StringProperty(
+        name="File", description="A file, or a folder with a .ply a frame", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
+    files: CollectionProperty(
+        name="Files",
+        description="Several are the frames of a sequence, in the natural order of their names",
+        type=bpy.types.OperatorFileListElement,
+        options={"HIDDEN", "SKIP_SAVE"},
+    )
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
     look: EnumProperty(name="Look", items=LOOK_ITEMS, default="Automatic")
     opacity_cut: FloatProperty(
         name="Opacity Cut",
@@ -35,10 +82,19 @@ class TIMESPLAT_OT_import_ply(bpy.types.Operator):
         min=0,
         max=1,
     )
+    up: EnumProperty(name="Up Axis", description="What points up in the file", items=UP_ITEMS, default="AUTO")
     use_clip: BoolProperty(
         name="Set Frame Range",
         description="Give the scene the frame range and the frame rate of the clip",
         default=False,
+    )
+    frame_start: IntProperty(name="Start Frame", description="Frame of a sequence's first file", default=1)
+    fps: FloatProperty(
+        name="Frame Rate",
+        description="Files a second of a sequence; it matters where Set Frame Range is on, and in exports",
+        default=24,
+        min=0.01,
+        soft_max=240,
     )
 
     @classmethod
@@ -46,30 +102,57 @@ class TIMESPLAT_OT_import_ply(bpy.types.Operator):
         return context.mode == "OBJECT"
 
     def invoke(self, context, event):
-        if self.filepath:  # dropped on the viewport
+        if self.filepath or self.files:  # dropped on the viewport
             return context.window_manager.invoke_props_dialog(self)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context):
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        for name in ("look", "opacity_cut", "up", "use_clip"):
+            layout.prop(self, name)
+        if len(self.files) != 1 or (context.space_data and context.space_data.type == "FILE_BROWSER"):
+            column = layout.column(heading="Sequence")
+            column.prop(self, "frame_start")
+            column.prop(self, "fps")
+
+    def paths(self) -> list[Path]:
+        """The files that were chosen; those of a folder if nothing in it was. Raises InputError."""
+        if names := [f.name for f in self.files if f.name]:
+            return [Path(bpy.path.abspath(self.directory)) / name for name in names]
+        if not self.filepath:
+            raise InputError("No file was chosen; choose one, or a folder with a .ply a frame.")
         path = Path(bpy.path.abspath(self.filepath))
+        return formats.folder_files(path) if path.is_dir() else [path]
+
+    def execute(self, context):
         try:
-            asset = read_ply(path)
+            paths = self.paths()
+            loaded = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
-        display.add_asset(asset, path.stem, look=self.look, cut=self.opacity_cut, context=context)
+        asset, path = loaded.asset, paths[0]
+        name = path.stem if len(paths) == 1 else path.parent.name
+        ob = display.add_asset(asset, name, look=self.look, cut=self.opacity_cut, context=context)
+        ob.rotation_euler.x = TURNS[loaded.up if self.up == "AUTO" else self.up]
         if self.use_clip:
             display.play_clip(context.scene, asset.clip)
-        self.report({"INFO"}, f"{len(asset)} Gaussians from {path.name}; their sRGB colours are linear now.")
+        where = path.name if len(paths) == 1 else f"{len(paths)} files in {path.parent.name}"
+        said = f"{len(asset)} Gaussians from {where}; their sRGB colours are linear now. {loaded.note}"
+        self.report({"INFO"}, said.strip())
         return {"FINISHED"}
 
 
-class TIMESPLAT_FH_ply(bpy.types.FileHandler):
-    bl_idname = "TIMESPLAT_FH_ply"
+class TIMESPLAT_FH_splats(bpy.types.FileHandler):
+    """Several files that are dropped at once are a sequence. Where another handler takes the suffix too (Blender's
+    own for .ply and .usd), Blender asks which one is meant."""
+
+    bl_idname = "TIMESPLAT_FH_splats"
     bl_label = "4D Gaussians"
-    bl_import_operator = "timesplat.import_ply"
-    bl_file_extensions = ".ply"
+    bl_import_operator = "timesplat.import_asset"
+    bl_file_extensions = ";".join(SUFFIXES)
 
     @classmethod
     def poll_drop(cls, context):
@@ -77,10 +160,10 @@ class TIMESPLAT_FH_ply(bpy.types.FileHandler):
 
 
 def _menu(self, context):
-    self.layout.operator(TIMESPLAT_OT_import_ply.bl_idname, text="4D Gaussians (.ply)")
+    self.layout.operator("timesplat.import_asset", text="4D Gaussians (.ply, .splat, .spz, .usd)")
 
 
-CLASSES = (TIMESPLAT_OT_import_ply, TIMESPLAT_FH_ply)
+CLASSES = (TIMESPLAT_OT_import_asset, TIMESPLAT_FH_splats)
 
 
 def register() -> None:

@@ -34,13 +34,13 @@ def test_the_zip_holds_what_it_should_and_no_more(extension):
 
 
 USE = """
-done = bpy.ops.timesplat.import_ply(filepath=sys.argv[1], use_clip=True, look="Splats")
+done = bpy.ops.timesplat.import_asset(filepath=sys.argv[1], use_clip=True, look="Splats")
 ob, scene = bpy.context.object, bpy.context.scene
 result = dict(done=list(done), kind=ob.type, count=len(ob.data.points), scale=list(ob.scale), at=list(ob.location),
     range=[scene.frame_start, scene.frame_end], fps=scene.render.fps / scene.render.fps_base,
     label=scene.timesplat.bl_rna.name, modules=[m for m in sys.modules if m.split(".")[0] == "timesplat"])
 try:
-    bpy.ops.timesplat.import_ply(filepath=sys.argv[2])
+    bpy.ops.timesplat.import_asset(filepath=sys.argv[2])
 except RuntimeError as e:
     result["refused"] = str(e)
 bpy.ops.preferences.addon_disable(module=name)
