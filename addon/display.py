@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Puts an Asset into the scene: a point cloud that Geometry Nodes move and fade from Scene Time.
+"""Puts an Asset into the scene: a point cloud that Geometry Nodes (nodes.py) move and fade from Scene Time; and
+the panel with its sliders.
 
-Everything that plays is in the .blend, at fractional frames too: it opens and scrubs without this add-on.
 The point cloud holds the Gaussians at their own times, with the attributes
     gs_velocity, gs_t, gs_sigma_t, gs_opacity      the 4D parameters (time -1..1 over the clip)
     gs_scale, gs_rotation                          σ along the axes, quaternion of the axes
     gs_color                                       LINEAR colour: the asset's sRGB is converted here, once,
                                                    because Blender blends in linear light
+    gs_order                                       a random order in 0..1, for the slider Density
     gs_radius, gs_reach, gs_row_0..2               radius of each look; rows of (R S)⁻¹ for the shader
-and the modifier evaluates positions, `gs_alpha` (opacity at the moment) and radius, and takes out what is
-fainter than its Opacity Cut. Looks: Points are opaque dots, fast; Splats are spheres of three σ whose shader
-computes gs_alpha · exp(-½ d²) with d the distance, in σ, at which the view ray passes the centre.
+and the modifier evaluates positions, `gs_alpha` (opacity at the moment) and radius. Looks: Points are opaque
+dots, fast; Splats are spheres of three σ whose shader computes gs_alpha · exp(-½ d²) with d the distance, in σ,
+at which the view ray passes the centre. Custom properties of the object: `timesplat` (1: it is an asset),
+`timesplat_clip` (the Clip), and what others note there (`timesplat_source`: names of the original objects).
 
     python -m timesplat.addon.display asset.ply asset.blend      writes a .blend to look at
 """
@@ -19,6 +21,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import bpy
@@ -27,9 +30,11 @@ import numpy as np
 from ..datagen.rigs import CANONICAL, FOV, spherical
 from ..datagen.sequence import InputError, Normalisation
 from ..model.asset import VISIBLE, Asset, Clip, linear_from_srgb, read_ply, rotation_matrices
+from . import nodes
+from .nodes import LOOKS, set_input
 
-GROUP = "Timesplat 1"  # the number counts versions of the node group, so that old files keep theirs
-LOOKS = ("Automatic", "Points", "Splats")  # Automatic: Points in the viewport, Splats in renders
+__all__ = ["LOOKS", "add_asset", "follow", "is_asset", "play_clip", "sampler", "save_blend", "set_input"]
+
 REACH = 3.0  # radius of a splat's sphere in σ
 THINNEST = 1e-3  # σ of the shader's splats is at least this times the largest one, for float32's sake
 TRANSPARENT_BOUNCES = 512  # how many splats a ray may pass
@@ -40,34 +45,27 @@ def add_asset(asset: Asset, name: str, *, look: str = "Automatic", cut: float = 
     is the normalisation, so that it lies over what it was made from. `cut`: opacity below which a Gaussian
     is left out at a moment. Needs Object Mode; raises the scene's limit of transparent bounces."""
     context = context or bpy.context
-    ob = _point_cloud(asset.xyz, name, context)
+    ob = point_cloud(asset.xyz, name, context)
     scale, translation = asset.clip.scale, asset.clip.translation
     ob.scale, ob.location = (scale,) * 3, translation
     ob["timesplat"] = 1  # captures leave assets out
-    _attributes(ob.data, asset)
+    ob["timesplat_clip"] = asdict(asset.clip)
+    write_attributes(ob.data, attributes(asset))
     modifier = ob.modifiers.new("Timesplat", "NODES")
-    modifier.node_group = _group()
+    modifier.node_group = nodes.group(has_point_clouds())
     for key, value in {
-        "Look": LOOKS.index(look),
+        "Look": look,
         "Opacity Cut": float(cut),
         "Frame Start": float(asset.clip.frame_start),
         "Frame End": float(asset.clip.frame_end),
     }.items():
         set_input(modifier, key, value)
-    for material in (_points_material(), _splats_material()):
+    for material in (nodes.points_material(), nodes.splats_material()):
         ob.data.materials.append(material)
     if hasattr(context.scene, "cycles"):
         cycles = context.scene.cycles
         cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
     return ob
-
-
-def set_input(modifier, name: str, value) -> None:
-    """Sets an input of the modifier by the name it shows ("Look" takes an index into LOOKS)."""
-    items = modifier.node_group.interface.items_tree
-    identifier = next(i.identifier for i in items if i.name == name and i.in_out == "INPUT")
-    modifier[identifier] = value
-    modifier.id_data.update_tag()
 
 
 def play_clip(scene, clip: Clip) -> None:
@@ -81,12 +79,12 @@ def play_clip(scene, clip: Clip) -> None:
 # ---------------------------------------------------------------- data
 
 
-def _has_point_clouds() -> bool:
+def has_point_clouds() -> bool:
     """Whether this Blender makes PointCloud objects; 4.2 does not, a mesh of vertices stands in there."""
     return "POINTCLOUD" in bpy.ops.object.convert.get_rna_type().properties["target"].enum_items
 
 
-def _point_cloud(xyz: np.ndarray, name: str, context):
+def point_cloud(xyz: np.ndarray, name: str, context):
     """A PointCloud cannot be resized, so that it is made by converting a mesh of vertices."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(xyz))
@@ -101,7 +99,7 @@ def _point_cloud(xyz: np.ndarray, name: str, context):
     ob.hide_set(False)
     ob.select_set(True)
     context.view_layer.objects.active = ob
-    if not _has_point_clouds():
+    if not has_point_clouds():
         return ob
     bpy.ops.object.convert(target="POINTCLOUD")
     ob = context.view_layer.objects.active
@@ -111,12 +109,14 @@ def _point_cloud(xyz: np.ndarray, name: str, context):
     return ob
 
 
-def _attributes(cloud, asset: Asset) -> None:
+def attributes(asset: Asset) -> list[tuple]:
+    """(name, type, key of its values, array of N rows) of every attribute of the data but the position."""
     soft = asset.soft_scale()  # Cycles does not blur by a share of a pixel as splat rasterisers do
     scale = np.maximum(soft, THINNEST * soft.max(1, keepdims=True))
     rows = (rotation_matrices(asset.rotation) / scale[:, None, :]).transpose(0, 2, 1)  # (RS)⁻¹ = S⁻¹ Rᵀ
     color = np.concatenate([linear_from_srgb(asset.rgb), np.ones((len(asset), 1), np.float32)], 1)
-    for name, kind, key, values in (
+    order = np.random.default_rng(0).permutation(len(asset)) / len(asset)
+    found = [
         ("gs_velocity", "FLOAT_VECTOR", "vector", asset.velocity),
         ("gs_t", "FLOAT", "value", asset.t),
         ("gs_sigma_t", "FLOAT", "value", asset.sigma_t),
@@ -124,173 +124,135 @@ def _attributes(cloud, asset: Asset) -> None:
         ("gs_scale", "FLOAT_VECTOR", "vector", asset.scale),
         ("gs_rotation", "QUATERNION", "value", asset.rotation),
         ("gs_color", "FLOAT_COLOR", "color", color),
+        ("gs_order", "FLOAT", "value", order),
         ("gs_radius", "FLOAT", "value", np.sort(soft, 1)[:, 1]),  # covers a flat splat's face
         ("gs_reach", "FLOAT", "value", REACH * scale.max(1)),
         *((f"gs_row_{i}", "FLOAT_VECTOR", "vector", rows[:, i]) for i in range(3)),
-    ):
-        attribute = cloud.attributes.new(name, kind, "POINT")
+    ]
+    return found + (nodes.native_attributes(asset) if nodes.NATIVE else [])
+
+
+def write_attributes(data, found: list[tuple]) -> None:
+    for name, kind, key, values in found:
+        attribute = data.attributes.new(name, kind, "POINT")
         attribute.data.foreach_set(key, np.ascontiguousarray(values, np.float32).ravel())
 
 
-# ---------------------------------------------------------------- nodes
+# ---------------------------------------------------------------- the object
 
 
-class _Nodes:
-    """Writes node trees as expressions: every method adds a node and returns its first visible output."""
-
-    def __init__(self, tree) -> None:
-        self.tree = tree
-
-    def add(self, kind: str, *inputs, **settings):
-        """A node with its settings and its visible inputs in order (a socket, a value, None = default)."""
-        node = self.tree.nodes.new(kind)
-        for key, value in settings.items():
-            setattr(node, key, value)
-        visible = [s for s in node.inputs if s.enabled and not s.is_unavailable]
-        for socket, value in zip(visible, inputs, strict=False):
-            self.put(socket, value)
-        count = len(self.tree.nodes)
-        node.location = (190 * (count // 4), -240 * (count % 4))
-        return node
-
-    def put(self, socket, value) -> None:
-        if isinstance(value, bpy.types.NodeSocket):
-            self.tree.links.new(value, socket)
-        elif value is not None:
-            socket.default_value = value
-
-    def out(self, kind: str, *inputs, **settings):
-        return next(s for s in self.add(kind, *inputs, **settings).outputs if s.enabled)
-
-    def math(self, operation: str, *inputs):
-        return self.out("ShaderNodeMath", *inputs, operation=operation)
-
-    def vector(self, operation: str, *inputs):
-        node = self.add("ShaderNodeVectorMath", *inputs, operation=operation)
-        return node.outputs["Value" if operation == "DOT_PRODUCT" else "Vector"]
-
-    def named(self, name: str, kind: str = "FLOAT"):
-        return self.out("GeometryNodeInputNamedAttribute", name, data_type=kind)
+def is_asset(ob) -> bool:
+    """Whether the object holds Gaussians, so that its sliders are there to be drawn."""
+    return bool(ob and ob.get("timesplat") and sampler(ob))
 
 
-def _group():
-    """The shared node group: made once a file."""
-    clouds = _has_point_clouds()
-    name = GROUP if clouds else f"{GROUP} Mesh"
-    if tree := bpy.data.node_groups.get(name):
-        return tree
-    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    tree.is_modifier = True
-    new = tree.interface.new_socket
-    new("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    new("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    menu = new("Look", in_out="INPUT", socket_type="NodeSocketMenu")
-    for name, value, low, high in (
-        ("Opacity Cut", VISIBLE, 0, 1),
-        ("Point Size", 1.0, 0, 100),
-        ("Frame Start", 0.0, -1e6, 1e6),
-        ("Frame End", 23.0, -1e6, 1e6),
-    ):
-        socket = new(name, in_out="INPUT", socket_type="NodeSocketFloat")
-        socket.default_value, socket.min_value, socket.max_value = value, low, high
-    n = _Nodes(tree)
-    given = n.add("NodeGroupInput").outputs
-
-    # t = -1..1 over the clip, held at its ends; 0 where the clip is one frame
-    frame = n.add("GeometryNodeInputSceneTime").outputs["Frame"]
-    start, end = given["Frame Start"], given["Frame End"]
-    inside = n.math("MINIMUM", n.math("MAXIMUM", frame, start), end)
-    span = n.math("SUBTRACT", end, start)
-    twice = n.math("MULTIPLY", n.math("SUBTRACT", inside, start), 2.0)
-    time = n.math("DIVIDE", n.math("SUBTRACT", twice, span), n.math("MAXIMUM", span, 1e-6))
-
-    # gs_alpha = gs_opacity · exp(-½ (t - gs_t)² / gs_sigma_t²)
-    away = n.math("SUBTRACT", time, n.named("gs_t"))
-    lives = n.math("DIVIDE", away, n.named("gs_sigma_t"))
-    fade = n.math("EXPONENT", n.math("MULTIPLY", n.math("MULTIPLY", lives, lives), -0.5))
-    alpha = n.math("MULTIPLY", n.named("gs_opacity"), fade)
-    g = given["Geometry"] if clouds else n.out("GeometryNodeMeshToPoints", given["Geometry"])
-    g = n.out("GeometryNodeStoreNamedAttribute", g, None, "gs_alpha", alpha, data_type="FLOAT")
-    faint = n.math("LESS_THAN", n.named("gs_alpha"), given["Opacity Cut"])
-    g = n.out("GeometryNodeDeleteGeometry", g, faint, domain="POINT")
-
-    # position = own position + gs_velocity · (t - gs_t)
-    away = n.math("SUBTRACT", time, n.named("gs_t"))
-    step = n.add("ShaderNodeVectorMath", n.named("gs_velocity", "FLOAT_VECTOR"), operation="SCALE")
-    n.put(step.inputs["Scale"], away)
-    g = n.out("GeometryNodeSetPosition", g, None, None, step.outputs["Vector"])
-
-    size = n.math("MULTIPLY", n.named("gs_radius"), given["Point Size"])
-    points = n.out("GeometryNodeSetPointRadius", g, None, size)
-    points = n.out("GeometryNodeSetMaterial", points, None, _points_material())
-    splats = n.out("GeometryNodeSetPointRadius", g, None, n.named("gs_reach"))
-    splats = n.out("GeometryNodeSetMaterial", splats, None, _splats_material())
-    viewport = n.add("GeometryNodeIsViewport").outputs[0]
-    automatic = n.out("GeometryNodeSwitch", viewport, splats, points, input_type="GEOMETRY")
-
-    choice = n.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
-    for old, look in zip(choice.enum_items, LOOKS, strict=False):  # renamed, not replaced: an item keeps the
-        old.name = look  # number that it was born with, and the numbers are to be indices into LOOKS
-    for look in LOOKS[len(choice.enum_items) :]:
-        choice.enum_items.new(look)
-    n.put(choice.inputs[0], given["Look"])
-    for look, geometry in zip(LOOKS, (automatic, points, splats), strict=True):
-        n.put(choice.inputs[look], geometry)
-    n.put(n.add("NodeGroupOutput").inputs[0], choice.outputs[0])
-    menu.default_value = LOOKS[0]
-    return tree
+def sampler(ob):
+    """The modifier that plays the asset; None if there is none."""
+    for modifier in ob.modifiers:
+        if modifier.type == "NODES" and modifier.node_group and modifier.node_group.name.startswith("Timesplat "):
+            return modifier
+    return None
 
 
-def _material(name: str):
-    """-> (material, its emptied tree or None where it was there already)."""
-    if material := bpy.data.materials.get(name):
-        return material, None
-    material = bpy.data.materials.new(name)
-    material.use_nodes = True
-    material.node_tree.nodes.clear()
-    if hasattr(material, "cycles"):
-        material.cycles.emission_sampling = "NONE"  # a million splats are no lamps
-    return material, _Nodes(material.node_tree)
+def follow(ob, original) -> bool:
+    """Parents the asset to the original, so that moving this moves that; the asset stays where it is. Only where
+    the original's transform stands still by itself: with an animated one, a constraint, a driver, physics or an
+    animated parent, the motion is in the Gaussians already. Returns whether it did."""
+    above = original
+    while above:
+        if above == ob or _moves(above):
+            return False
+        above = above.parent
+    bpy.context.view_layer.update()
+    ob.parent, ob.parent_type = original, "OBJECT"
+    ob.matrix_parent_inverse = original.matrix_world.inverted_safe()
+    return True
 
 
-def _points_material():
-    """Unlit colour: the light is in the pictures that the asset was made from."""
-    material, n = _material(f"{GROUP} Points")
-    if n:
-        color = n.add("ShaderNodeAttribute", attribute_name="gs_color").outputs["Color"]
-        n.add("ShaderNodeOutputMaterial", n.out("ShaderNodeEmission", color, 1.0))
-    return material
+def _moves(ob) -> bool:
+    if ob.constraints or ob.rigid_body or (ob.parent and ob.parent_type != "OBJECT"):
+        return True
+    animation = ob.animation_data
+    if not animation:
+        return False
+    moving = ("location", "rotation", "scale", "delta_")
+    if any(curve.data_path.startswith(moving) for curve in animation.drivers):
+        return True
+    actions = [animation.action, *(s.action for t in animation.nla_tracks for s in t.strips)]
+    return any(path.startswith(moving) for a in actions if a for path in _paths(a))
 
 
-def _splats_material():
-    """On the front of a sphere: u = (RS)⁻¹ (hit - centre), w = (RS)⁻¹ view direction; the ray passes the
-    centre at the distance |u × w| / |w|, which float32 takes well for flat splats too."""
-    material, n = _material(f"{GROUP} Splats")
-    if not n:
-        return material
+def _paths(action) -> list[str]:
+    """Data paths that an action animates; those of all its slots."""
+    if not hasattr(action, "layers"):  # before Blender 4.4
+        return [c.data_path for c in action.fcurves]
+    strips = [s for layer in action.layers for s in layer.strips]
+    return [c.data_path for s in strips for bag in s.channelbags for c in bag.fcurves]
 
-    def attribute(name: str, output: str):
-        return n.add("ShaderNodeAttribute", attribute_name=name).outputs[output]
 
-    def local(world):  # a difference of places: the object's scale is undone, its location does not matter
-        node = n.add("ShaderNodeVectorTransform", world, vector_type="VECTOR")
-        node.convert_from, node.convert_to = "WORLD", "OBJECT"
-        return node.outputs[0]
+# ---------------------------------------------------------------- the panel
 
-    geometry = n.add("ShaderNodeNewGeometry").outputs
-    centre = n.add("ShaderNodePointInfo").outputs["Position"]
-    offset = local(n.vector("SUBTRACT", geometry["Position"], centre))
-    ray = local(geometry["Incoming"])
-    rows = [attribute(f"gs_row_{i}", "Vector") for i in range(3)]
-    u = n.out("ShaderNodeCombineXYZ", *(n.vector("DOT_PRODUCT", row, offset) for row in rows))
-    w = n.out("ShaderNodeCombineXYZ", *(n.vector("DOT_PRODUCT", row, ray) for row in rows))
-    cross = n.vector("CROSS_PRODUCT", u, w)
-    d2 = n.math("DIVIDE", n.vector("DOT_PRODUCT", cross, cross), n.vector("DOT_PRODUCT", w, w))
-    alpha = n.math("MULTIPLY", attribute("gs_alpha", "Fac"), n.math("EXPONENT", n.math("MULTIPLY", d2, -0.5)))
-    clear = n.out("ShaderNodeBsdfTransparent")
-    glow = n.out("ShaderNodeEmission", attribute("gs_color", "Color"), 1.0)
-    n.add("ShaderNodeOutputMaterial", n.out("ShaderNodeMixShader", alpha, clear, glow))
-    return material
+
+class TIMESPLAT_OT_set_standard(bpy.types.Operator):
+    """Show colours as they are: the view transform Standard. Others, like AgX, change the asset's colours"""
+
+    bl_idname = "timesplat.set_standard"
+    bl_label = "Set Standard"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    def execute(self, context):
+        context.scene.view_settings.view_transform = "Standard"
+        return {"FINISHED"}
+
+
+class TIMESPLAT_PT_result(bpy.types.Panel):
+    bl_label = "Result"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Timesplat"
+    bl_order = 10
+
+    @classmethod
+    def poll(cls, context):
+        return is_asset(context.object)
+
+    def draw(self, context):
+        """Only what is at hand: nothing is evaluated, read or counted here."""
+        layout, ob = self.layout, context.object
+        modifier = sampler(ob)
+        layout.use_property_split = True
+        count = len(ob.data.points if ob.type == "POINTCLOUD" else ob.data.vertices)
+        layout.label(text=f"{count:,} Gaussians", icon="POINTCLOUD_DATA")
+        panel, column = "", layout.column(align=True)
+        for name, (group, *_) in nodes.SLIDERS.items():
+            found = nodes.rna(modifier, name)
+            if found is None:
+                continue
+            if group != panel:
+                panel, column = group, layout.column(align=True)
+            column.prop(*found, text=name)
+        if context.scene.view_settings.view_transform != "Standard":
+            row = layout.row()
+            row.label(text="View transform changes the colours", icon="ERROR")
+            row.operator("timesplat.set_standard")
+        column = layout.column(align=True)
+        column.operator("timesplat.compare", icon="IMAGE_DATA")
+        column.operator("timesplat.bake", icon="ACTION")
+        column.operator("timesplat.delete_rectangle", icon="SELECT_SET")
+        column.operator_menu_enum("timesplat.delete", "what", text="Delete", icon="TRASH")
+
+
+CLASSES = (TIMESPLAT_OT_set_standard, TIMESPLAT_PT_result)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
 
 
 # ---------------------------------------------------------------- a .blend of its own
