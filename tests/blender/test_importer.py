@@ -26,8 +26,10 @@ def load(**options):
                 range=[scene.frame_start, scene.frame_end], fps=scene.render.fps / scene.render.fps_base)
 def seen(frame):
     bpy.context.scene.frame_set(int(frame), subframe=frame % 1)
-    ev = bpy.context.object.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    return [list(ev.matrix_world @ p.co) for p in ev.data.points]
+    ob = bpy.context.object
+    for i in bpy.context.evaluated_depsgraph_get().object_instances:  # where a mesh stands in, it is an instance of it
+        if i.object.type == "POINTCLOUD" and (i.object.original == ob or i.parent and i.parent.original == ob):
+            return [list(i.matrix_world @ p.co) for p in i.object.data.points]
 """
 
 
