@@ -178,29 +178,58 @@ def reconstruct(args: argparse.Namespace) -> int:
 
 
 def export_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote")
-    p.add_argument("out", type=Path, help=".usdc, .usda, .usdz or .blend to write")
-    p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old readers "
-                   "take as points (default), points alone, splats sampled at every frame")  # fmt: skip
+    p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote, or a USD file of Timesplat's")
+    p.add_argument("out", type=Path, nargs="?", help=".usdc, .usda, .usdz, .ply, .blend to write; .splat with --frame")
+    p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
+                   "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
     p.add_argument("--half", action="store_true", help="USD: half precision")
+    p.add_argument("--original", type=Path, help="USD: file of the original object, for a variant set")
+    p.add_argument("--check", action="store_true", help="USD: exit with 1 if the validator complains")
+    p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply or .splat")
+    p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a 3DGS .ply a frame into a new folder")
 
 
 def export(args: argparse.Namespace) -> int:
-    """Export an asset to USD (Gaussian splat prim that older readers take as points) or to a .blend."""
-    from .model.asset import read_ply
+    """Export an asset: USD (Gaussian splats that older readers take as points), 3DGS .ply slices, or a .blend."""
+    import tempfile
 
-    asset = read_ply(args.asset)
-    suffix = args.out.suffix.lower()
-    if suffix in (".usd", ".usda", ".usdc", ".usdz"):
-        from .model.usd import write_usd
+    from .model.asset import read_ply, write_ply
+    from .model.formats import write_slice, write_slices
+    from .model.usd import SUFFIXES, check_usd, read_usd, write_usd
 
-        write_usd(args.out, asset, mode=args.mode, half=args.half)
-    elif suffix == ".blend":
-        save_blend(args.asset, args.out)
+    usd = args.out is not None and args.out.suffix.lower() in SUFFIXES
+    if (args.out is None) == (args.sequence is None):
+        raise InputError("export: name one file to write, or a folder by --sequence.")
+    if not usd and (args.mode != "splats" or args.half or args.original or args.check):
+        raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
+    if args.frame is not None and (usd or args.sequence):
+        raise InputError("export: --frame is for one .ply or .splat; drop it.")
+    asset = (read_usd if args.asset.suffix.lower() in SUFFIXES else read_ply)(args.asset)
+    if args.sequence:
+        count = write_slices(args.sequence, asset, args.asset.stem)
+        print(f"{args.sequence}: {count} files")
+        return 0
+    count = len(asset)
+    if args.frame is not None:
+        count = write_slice(args.out, asset, args.frame)
+    elif usd:
+        write_usd(args.out, asset, mode=args.mode, half=args.half, original=args.original)
+    elif args.out.suffix.lower() == ".ply":
+        write_ply(args.out, asset)
+    elif args.out.suffix.lower() == ".blend":
+        with tempfile.TemporaryDirectory() as folder:
+            ply = Path(folder) / f"{args.asset.stem}.ply"
+            write_ply(ply, asset)
+            save_blend(ply, args.out)
     else:
-        raise InputError(f"{args.out}: cannot write {suffix or 'that'}; choose .usdc, .usda, .usdz or .blend.")
-    print(f"{args.out}: {len(asset)} Gaussians, {args.out.stat().st_size / 1e6:.1f} MB")
-    return 0
+        raise InputError(f"{args.out}: cannot write that; choose .usdc, .usda, .usdz, .ply or .blend.")
+    print(f"{args.out}: {count} Gaussians, {args.out.stat().st_size / 1e6:.1f} MB")
+    complaints = check_usd(args.out) if usd else []
+    for complaint in complaints:
+        print(f"  {complaint}")
+    if usd and not complaints:
+        print("  the validator has no complaints")
+    return 1 if args.check and complaints else 0
 
 
 def save_blend(asset: Path, out: Path) -> None:

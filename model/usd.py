@@ -5,7 +5,9 @@ The prim is a `ParticleField3DGaussianSplat` (OpenUSD 26.03). It also carries `p
 `primvars:displayColor` and `displayOpacity`, and the stage says in `fallbackPrimTypes` that a reader which
 does not know the type shall take it as `Points`. Attributes are authored raw, so that an older pxr (the
 one inside Blender) writes the same file. `primvars:gs4d:*` keep the 4D parameters, from which `read_usd`
-gives the Asset back. Needs numpy and pxr (usd-core).
+gives the Asset back, and `gs4d:time` is the time they are in: -1 at the clip's first frame, 1 at its last, so
+that a layer offset moves it with the samples. Needs numpy and pxr (usd-core). docs/pipelines.md is for those
+who read the files.
 
 What is sampled over time
     positions   two samples where that says it all; one a frame, with |t - μ_t| held within REACH·σ_t, where
@@ -20,64 +22,71 @@ Spherical harmonics are sRGB-encoded, as in every 3DGS file; displayColor is lin
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
-import sys
 import tempfile
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from ..datagen.sequence import InputError
-from .asset import SH_C0, VISIBLE, Asset, Clip, atomic, check, linear_from_srgb, rotation_matrices
+from .asset import SH_C0, VISIBLE, Asset, atomic, check, linear_from_srgb, rotation_matrices
+from .usd_check import check_usd
+from .usd_read import ORIGINAL, RECONSTRUCTION, SH, SPLAT, VARIANTS, open_stage, pxr, quiet, read_usd
 
-SPLAT = "ParticleField3DGaussianSplat"
-PRIM = "/timesplat/splats"
+__all__ = ["MODES", "SUFFIXES", "check_usd", "read_usd", "write_usd"]
+
+ROOT = "/timesplat"
+PRIM = f"{ROOT}/splats"
 BOX = 5.0  # how far, in normalised units, an invisible point may stray before positions are sampled per frame
 REACH = 4.0  # lifetimes after which a Gaussian stands still: exp(-½·4²) rounds to an opacity of 0
 EXTENT_SIGMAS = 3.0
 HALF_TINY, HALF_MAX = 2.0**-14, 65504.0
 MODES = ("splats", "points", "frames")
 SUFFIXES = (".usd", ".usdc", ".usda", ".usdz")
+PACKAGED = (".usd", ".usda", ".usdc", ".png", ".jpg", ".jpeg", ".exr", ".avif", ".m4a", ".mp3", ".wav")  # in a .usdz
 
 
-def _pxr():
-    try:
-        from pxr import Gf, Sdf, Usd, UsdUtils, Vt
-    except ImportError:
-        raise InputError(
-            f"{sys.executable} lacks the package usd-core, which USD files need; install it, or timesplat[usd], there."
-        ) from None
-    return Gf, Sdf, Usd, UsdUtils, Vt
-
-
-# ---------------------------------------------------------------- writing
-
-
-def write_usd(path: str | Path, asset: Asset, *, mode: str = "splats", half: bool = False) -> None:
+def write_usd(
+    path: str | Path,
+    asset: Asset,
+    *,
+    mode: str = "splats",
+    half: bool = False,
+    original: str | Path | None = None,
+) -> None:
     """Writes .usd/.usdc (binary), .usda (text) or .usdz (package); whole or not at all.
 
-    mode   splats   the Gaussian splat prim, which older readers take as points
-           points   plain `Points`, for pipelines that reference the file from a layer of their own
-                    (fallbackPrimTypes is read from the root layer alone)
-           frames   as splats, with positions at every frame, for readers that do not interpolate
-    half   everything but positions and opacities in half precision (positions would lose up to 0.0005 of the
-           object's half-side, opacities gain nothing; scales and lifetimes below 2^-14 are raised to it,
-           lifetimes above 65504 lowered)
-    Raises InputError: wrong suffix or mode, bad arrays, the disk."""
+    mode      splats   the Gaussian splat prim, which older readers take as points
+              points   plain `Points`, for pipelines that reference the file from a layer of their own
+                       (fallbackPrimTypes is read from the root layer alone)
+              frames   as splats, with positions at every frame, for readers that do not interpolate
+    half      everything but positions and opacities in half precision (positions would lose up to 0.0005 of the
+              object's half-side, opacities gain nothing; scales and lifetimes below 2^-14 are raised to it,
+              lifetimes above 65504 lowered)
+    original  USD file of the object that was reconstructed: the default prim gets a variant set `representation`
+              with `reconstruction` (selected) and `original`, which lies over it, frame on frame. A .usdz takes
+              in the original and the files it needs, all from the original's folder; other files refer to it
+              by its relative path.
+    Raises InputError: wrong suffix or mode, bad arrays, the disk, an original that cannot be used."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: the name must end in {', '.join(SUFFIXES)}; choose one of these.")
     if mode not in MODES:
         raise InputError(f"{mode}: no such mode; choose one of {', '.join(MODES)}.")
     check(asset, path)
-    _, Sdf, _, UsdUtils, _ = _pxr()
-    stage = _stage(asset, mode, half, path)
-    with atomic(path) as tmp, tempfile.TemporaryDirectory() as folder:
-        inner = Path(folder) / "splats.usdc" if path.suffix.lower() == ".usdz" else tmp
+    _, Sdf, _, _, UsdUtils, _ = pxr()
+    stage = _stage(asset, mode, half, path, variants=original is not None)
+    with atomic(path) as tmp, tempfile.TemporaryDirectory() as folder, quiet():
+        package = Path(folder) / "package.usdz" if path.suffix.lower() == ".usdz" else None
+        inner = Path(folder) / "splats.usdc" if package else tmp
+        if original is not None:
+            _add_original(stage.GetRootLayer(), Path(original), path, Path(folder))
         try:
             ok = stage.GetRootLayer().Export(str(inner))
-            if inner is not tmp:
-                package = Path(folder) / "splats.usdz"
+            if package:
                 ok = ok and UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(package))
                 shutil.copyfile(package, tmp)
         except RuntimeError as e:  # Tf.ErrorException is one, and is many lines long
@@ -88,13 +97,81 @@ def write_usd(path: str | Path, asset: Asset, *, mode: str = "splats", half: boo
         old.Reload(force=True)
 
 
-def _stage(asset: Asset, mode: str, half: bool, path: Path):
-    Gf, Sdf, Usd, _, Vt = _pxr()
-    clip, T = asset.clip, Sdf.ValueTypeNames
+def _add_original(layer, original: Path, path: Path, folder: Path) -> None:
+    """Puts the original into the variant ORIGINAL, turned and scaled to Z-up metres and with its time codes as they
+    are (a reference would convert them from its frame rate to ours)."""
+    Gf, Sdf, _, UsdGeom, UsdUtils, Vt = pxr()
+    source = open_stage(original)
+    if path.exists() and path.samefile(original):
+        raise InputError(f"{path}: it is the original itself; write to another file.")
+    prim = source.GetDefaultPrim()
+    roots = [p for p in source.GetPseudoRoot().GetChildren() if p.IsDefined() and not p.IsAbstract()]
+    if not prim and len(roots) != 1:
+        raise InputError(f"{original}: it has no default prim to refer to; set its defaultPrim.")
+    metres = UsdGeom.GetStageMetersPerUnit(source)
+    if not (np.isfinite(metres) and metres > 0):
+        raise InputError(f"{original}: its metersPerUnit is {metres:g}; set it to a positive number.")
+    if path.suffix.lower() == ".usdz":
+        if original.suffix.lower() == ".usdz":
+            original = _unpacked(original, folder)
+        home = original.parent.resolve()
+        layers, files, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(original)))
+        for name in [x.realPath for x in layers] + list(files):
+            if not Path(name).resolve().is_relative_to(home):
+                raise InputError(f"{original}: it refers to {name}, outside of its own folder; copy that beside it.")
+            if not name.lower().endswith(PACKAGED):
+                raise InputError(f"{original}: it refers to {name}, which has no place in a .usdz; write a .usdc.")
+        where = str(original.resolve())
+    else:
+        where = _relative(original, path)
+
+    def op(name: str, kind, value) -> str:
+        Sdf.AttributeSpec(parent, f"xformOp:{name}", kind).default = value
+        return f"xformOp:{name}"
+
+    parent = Sdf.CreatePrimInLayer(layer, f"{ROOT}{{{VARIANTS}={ORIGINAL}}}original")
+    parent.specifier, parent.typeName = Sdf.SpecifierDef, "Xform"
+    order = [op("scale", Sdf.ValueTypeNames.Double3, Gf.Vec3d(metres))] if metres != 1 else []
+    if UsdGeom.GetStageUpAxis(source) == "Y":
+        order.append(op("rotateX", Sdf.ValueTypeNames.Double, 90.0))
+    kind = Sdf.ValueTypeNames.TokenArray
+    Sdf.AttributeSpec(parent, "xformOpOrder", kind, Sdf.VariabilityUniform).default = Vt.TokenArray(order)
+    child = Sdf.PrimSpec(parent, "object", Sdf.SpecifierDef)  # its own transform stays its own
+    child.kind = "subcomponent"
+    rate = source.GetTimeCodesPerSecond() / layer.timeCodesPerSecond
+    root = Sdf.Path() if prim else roots[0].GetPath()
+    child.referenceList.prependedItems.append(Sdf.Reference(where, root, Sdf.LayerOffset(0, rate)))
+
+
+def _relative(original: Path, path: Path) -> str:
+    try:
+        relative = Path(os.path.relpath(original.resolve(), path.resolve().parent)).as_posix()
+    except ValueError:  # another drive
+        return original.resolve().as_posix()
+    return relative if relative.startswith("../") else f"./{relative}"
+
+
+def _unpacked(original: Path, folder: Path) -> Path:
+    """The root layer of a .usdz, unpacked: a package has no place in a package."""
+    try:
+        with zipfile.ZipFile(original) as z:
+            if any(i.compress_type != zipfile.ZIP_STORED for i in z.infolist()):
+                raise ValueError("it is compressed")
+            z.extractall(folder / "original")  # keeps inside of the folder
+            return folder / "original" / z.namelist()[0]
+    except (zipfile.BadZipFile, ValueError, IndexError) as e:
+        raise InputError(f"{original}: it is not a whole .usdz ({e}); export it again.") from None
+
+
+def _stage(asset: Asset, mode: str, half: bool, path: Path, variants: bool):
+    Sdf, Usd, Vt = (pxr()[i] for i in (1, 2, 5))
+    clip = asset.clip
+    positions, extent = _positions(asset, mode == "frames", path), _extent(asset)
     stage = Usd.Stage.CreateInMemory()
-    root = stage.DefinePrim("/timesplat", "Xform")
+    root = stage.DefinePrim(ROOT, "Xform")
     stage.SetDefaultPrim(root)
     Usd.ModelAPI(root).SetKind("component")
+    root.AddAppliedSchema("GeomModelAPI")
     for key, value in {
         "upAxis": "Z",
         "metersPerUnit": 1.0,
@@ -103,11 +180,27 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path):
         "startTimeCode": float(clip.frame_start),
         "endTimeCode": float(clip.frame_end),
         "documentation": "4D Gaussians by Timesplat. Spherical harmonics are sRGB-encoded as in 3DGS files, "
-        "displayColor is linear; primvars:gs4d:* are the parameters in time -1..1 over the clip.",
+        "displayColor is linear; primvars:gs4d:* are the parameters in the time gs4d:time.",
     }.items():
         stage.SetMetadata(key, value)
     if mode != "points":
         stage.SetMetadata("fallbackPrimTypes", {SPLAT: Vt.TokenArray(["Points"])})
+    with contextlib.ExitStack() as stack:
+        if variants:
+            choice = root.GetVariantSets().AddVariantSet(VARIANTS)
+            for name in (ORIGINAL, RECONSTRUCTION):
+                choice.AddVariant(name)
+            choice.SetVariantSelection(RECONSTRUCTION)
+            stack.enter_context(choice.GetVariantEditContext())
+        hint = (extent * clip.scale + clip.translation).astype(np.float32)
+        root.CreateAttribute("extentsHint", Sdf.ValueTypeNames.Float3Array, False).Set(Vt.Vec3fArray.FromNumpy(hint))
+        _author(stage, asset, mode, half, positions, extent)
+    return stage
+
+
+def _author(stage, asset: Asset, mode: str, half: bool, positions: dict, extent: np.ndarray) -> None:
+    Gf, Sdf, _, _, _, Vt = pxr()
+    clip, T = asset.clip, Sdf.ValueTypeNames
     prim = stage.DefinePrim(PRIM, "Points" if mode == "points" else SPLAT)
 
     def put(name: str, kind, value, *, uniform=False, primvar=False) -> None:
@@ -146,15 +239,16 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path):
     order = Vt.TokenArray(["xformOp:translate", "xformOp:scale"])
     put("xformOpOrder", T.TokenArray, order, uniform=True)
 
-    positions = {c: f3(p) for c, p in _positions(asset, mode == "frames", path).items()}
-    positions = positions if len(positions) > 1 else next(iter(positions.values()))
+    positions = {c: f3(p) for c, p in positions.items()}
+    if len(positions) == 1:
+        (positions,) = positions.values()
     curve = {float(f): asset.at(asset.frame_to_time(f))[1] for f in clip.frames}
     faded = {c: np.round(o * 1000) / 1000 for c, o in curve.items()}
     put("points", T.Point3fArray, positions)
     put("widths", T.FloatArray, _changing(f1, _widths(asset, curve)), primvar=True)
     put("primvars:displayColor", T.Color3fArray, f3(linear_from_srgb(asset.rgb)), primvar=True)
     put("primvars:displayOpacity", T.FloatArray, _changing(f1, faded), primvar=True)
-    put("extent", T.Float3Array, f3(_extent(asset)))
+    put("extent", T.Float3Array, f3(extent))
 
     scales = packed(s3, small(asset.scale))
     prim.SetCustomDataByKey("timesplat:pixel", float(clip.pixel))
@@ -169,7 +263,7 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path):
         put(f"orientations{h}", kind4, rotations)
         put("opacities", T.FloatArray, _changing(f1, faded))  # stored once, with displayOpacity
         put("radiance:sphericalHarmonicsDegree", T.Int, 0, uniform=True)
-        put(f"radiance:sphericalHarmonicsCoefficients{h}", kind3, packed(s3, (asset.rgb - 0.5) / SH_C0))
+        put(f"{SH}{h}", kind3, packed(s3, (asset.rgb - 0.5) / SH_C0))
 
     velocity = np.clip(asset.velocity, -HALF_MAX, HALF_MAX) if half else asset.velocity
     put("primvars:gs4d:position", T.Float3Array, f3(asset.xyz), primvar=True)
@@ -177,7 +271,7 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path):
     put("primvars:gs4d:mu_t", kind1, packed(s1, asset.t), primvar=True)
     put("primvars:gs4d:sigma_t", kind1, packed(s1, small(asset.sigma_t)), primvar=True)
     put("primvars:gs4d:opacity", kind1, packed(s1, asset.opacity), primvar=True)
-    return stage
+    put("gs4d:time", T.Double, {float(f): float(asset.frame_to_time(f)) for f in (clip.frame_start, clip.frame_end)})
 
 
 def _positions(asset: Asset, every: bool, path: Path) -> dict[float, np.ndarray]:
@@ -234,148 +328,3 @@ def _extent(asset: Asset) -> np.ndarray:
     if not low:
         return np.stack([(asset.xyz - reach).min(0), (asset.xyz + reach).max(0)])
     return np.stack([np.min(low, 0), np.max(high, 0)])
-
-
-# ---------------------------------------------------------------- reading
-
-
-def _open(path: Path):
-    Usd = _pxr()[2]
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; check the name.")
-    try:
-        return Usd.Stage.Open(str(path))
-    except RuntimeError:
-        raise InputError(f"{path}: it is damaged or not a USD file; export it again.") from None
-
-
-def read_usd(path: str | Path) -> Asset:
-    """The asset in a file that `write_usd` wrote (any mode), from the first prim with primvars:gs4d:*.
-    Raises InputError: no such file, not USD, no such prim, arrays that do not belong together."""
-    path = Path(path)
-    stage = _open(path)
-    prim = next((p for p in stage.Traverse() if p.HasAttribute("primvars:gs4d:mu_t")), None)
-    if prim is None:
-        raise InputError(f"{path}: no prim has primvars:gs4d:*; only USD written by Timesplat can be read.")
-
-    def get(*names: str) -> np.ndarray:
-        for name in names:
-            value = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
-            if value is not None:
-                return np.asarray(value).astype(np.float32)
-        raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
-
-    sh = "radiance:sphericalHarmonicsCoefficients"
-    if prim.HasAttribute("primvars:gs4d:rgb"):
-        rgb = get("primvars:gs4d:rgb")
-    else:
-        rgb = (0.5 + SH_C0 * get(sh, f"{sh}h").astype(np.float64)).astype(np.float32)
-    try:
-        rotation = get("orientations", "orientationsh", "primvars:gs4d:rotation")[:, [3, 0, 1, 2]]
-        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-        clip = Clip(
-            fps=stage.GetTimeCodesPerSecond(),
-            frame_start=round(stage.GetStartTimeCode()),
-            frame_end=round(stage.GetEndTimeCode()),
-            scale=prim.GetAttribute("xformOp:scale").Get()[0],
-            translation=tuple(prim.GetAttribute("xformOp:translate").Get()),
-            pixel=float(prim.GetCustomDataByKey("timesplat:pixel") or 0),
-        )
-    except (TypeError, ValueError, IndexError, RuntimeError):
-        raise InputError(f"{path}: orientations or xformOps are damaged; export it again.") from None
-    asset = Asset(
-        xyz=get("primvars:gs4d:position"),
-        t=get("primvars:gs4d:mu_t"),
-        velocity=get("primvars:gs4d:velocity"),
-        sigma_t=get("primvars:gs4d:sigma_t"),
-        scale=get("primvars:gs4d:scale"),
-        rotation=rotation,
-        rgb=rgb,
-        opacity=get("primvars:gs4d:opacity"),
-        clip=clip,
-    )
-    check(asset, path)
-    return asset
-
-
-# ---------------------------------------------------------------- checking
-
-
-def check_usd(path: str | Path) -> list[str]:
-    """Complaints about a USD file with splats, none if it is good: stage metadata, and for every splat prim
-    at every time sample array lengths, the SH count, NaN, ranges, unit quaternions and the extent; then
-    what UsdValidation has to say, where this pxr has it. Raises InputError if it cannot be opened."""
-    path = Path(path)
-    stage = _open(path)
-    complaints = [f"the stage has no {k}" for k in ("upAxis", "metersPerUnit") if not stage.HasAuthoredMetadata(k)]
-    if not stage.GetDefaultPrim():
-        complaints.append("the stage has no defaultPrim")
-    prims = [p for p in stage.TraverseAll() if p.GetTypeName() == SPLAT or p.HasAttribute("primvars:gs4d:mu_t")]
-    if not prims:
-        complaints.append(f"the stage has no {SPLAT} and no points with primvars:gs4d:*")
-    for prim in prims:
-        complaints += [f"{prim.GetPath()}: {c}" for c in _check_prim(prim)]
-    return complaints + _validation(stage)
-
-
-def _check_prim(prim) -> list[str]:
-    base = "positions" if prim.GetTypeName() == SPLAT else "points"
-    found: list[str] = []
-
-    def samples(name: str):
-        """(time code or None, array) of every sample."""
-        attribute = prim.GetAttribute(name)
-        for code in attribute.GetTimeSamples() or [None]:
-            value = attribute.Get() if code is None else attribute.Get(code)
-            yield code, np.zeros(0) if value is None else np.asarray(value)
-
-    n = len(next(samples(base))[1])
-    if n == 0:
-        return [f"{base} is empty"]
-    per_point = {base: 1, "points": 1, "widths": 1, "primvars:displayColor": 1, "primvars:displayOpacity": 1}
-    if base == "positions":
-        degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
-        sh = {"radiance:sphericalHarmonicsCoefficients": (3 if degree is None else degree) + 1}
-        for name, count in {"scales": 1, "orientations": 1, "opacities": 1, **{k: v**2 for k, v in sh.items()}}.items():
-            kinds = [k for k in (name, f"{name}h") if prim.GetAttribute(k).HasAuthoredValue()]
-            if len(kinds) != 1:
-                found.append(f"{name} must be there once, as float or as half")
-            per_point |= dict.fromkeys(kinds, count)
-        if not prim.GetStage().HasAuthoredMetadata("fallbackPrimTypes"):
-            found.append("the stage has no fallbackPrimTypes, so that older readers show nothing")
-    per_point |= {a.GetName(): 1 for a in prim.GetAttributes() if a.GetName().startswith("primvars:gs4d:")}
-    for name, count in per_point.items():
-        for code, a in samples(name):
-            where = name if code is None else f"{name} at {code:g}"
-            if len(a) != n * count:
-                found.append(f"{where} has {len(a)} values for {n} Gaussians, {n * count} belong there")
-            elif not np.isfinite(a).all():
-                found.append(f"{where} holds NaN or infinity")
-            elif "pacit" in name and (a.min() < 0 or a.max() > 1):
-                found.append(f"{where} leaves 0..1")
-            elif ("scale" in name or "sigma" in name) and a.min() <= 0:
-                found.append(f"{where} is not positive")
-            elif ("orientation" in name or "rotation" in name) and (
-                np.abs(np.linalg.norm(a.astype(np.float64), axis=1) - 1).max() > 2e-3  # half precision's
-            ):
-                found.append(f"{where} holds quaternions that are not of unit length")
-    extent = prim.GetAttribute("extent").Get()
-    if extent is None:
-        return [*found, "extent is missing"]
-    low, high = np.asarray(extent)
-    opacity = next((k for k in ("primvars:displayOpacity", "opacities", "opacitiesh") if k in per_point), None)
-    for code in prim.GetAttribute(opacity).GetTimeSamples() or [0]:
-        o, p = (np.asarray(prim.GetAttribute(k).Get(code)) for k in (opacity, base))
-        if not found and not ((p >= low) & (p <= high))[o > VISIBLE].all():
-            found.append(f"visible Gaussians leave the extent at {code:g}")
-    return found
-
-
-def _validation(stage) -> list[str]:
-    try:
-        from pxr import UsdValidation
-    except ImportError:
-        return []
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    errors = UsdValidation.ValidationContext(validators).Validate(stage)
-    return [f"UsdValidation: {e.GetErrorAsString()}" for e in errors]

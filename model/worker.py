@@ -13,6 +13,7 @@ to do; null or "" is the same as leaving a key out:
     export          USD, where Blender has none     (never imports torch)
         asset       .ply to read                    out         .usd* to write
         mode        splats | points | frames        half        true or false
+        original    .usd* of the object, for a variant beside the reconstruction
         done: out, complaints (the validator's, a list of sentences), bytes
     import          the other way round             (never imports torch)
         source      .usd* to read                   asset       .ply to write
@@ -49,6 +50,7 @@ _KEYS = {
     "task": "text", "watch": "true or false", "sequence": "text", "asset": "text", "method": "text",
     "device": "text", "checkpoint": "text", "indices": "list", "refine": "number", "budget": "text",
     "max_loss": "number", "out": "text", "mode": "text", "half": "true or false", "source": "text",
+    "original": "text",
 }  # fmt: skip
 _NEEDED = {"reconstruct": ("sequence", "asset"), "export": ("asset", "out"), "import": ("source", "asset")}
 _NEEDED |= {"selftest": ()}
@@ -140,7 +142,13 @@ def _export(request: dict, progress) -> dict:
     progress(0.0, "reading the asset")
     asset = read_ply(request["asset"])
     progress(0.2, f"writing {out.name}")
-    write_usd(out, asset, mode=request.get("mode", "splats"), half=request.get("half", False))
+    write_usd(
+        out,
+        asset,
+        mode=request.get("mode", "splats"),
+        half=request.get("half", False),
+        original=request.get("original"),
+    )
     progress(0.7, f"checking {out.name}")
     return {"out": request["out"], "complaints": check_usd(out), "bytes": out.stat().st_size}
 

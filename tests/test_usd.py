@@ -15,7 +15,8 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, linear_from_srgb
-from timesplat.model.usd import BOX, PRIM, SPLAT, check_usd, read_usd, write_usd
+from timesplat.model.usd import BOX, PRIM, check_usd, read_usd, write_usd
+from timesplat.model.usd_read import SPLAT
 
 CLIP = Clip(30.0, 10, 33, 2.0, (1.0, 2.0, 3.0), pixel=0.01)
 
@@ -162,7 +163,7 @@ def test_static_assets_and_single_frames_have_no_samples(tmp_path):
     for asset in (a, b):
         write_usd(tmp_path / "a.usdc", asset)
         _stage, prim = splats(tmp_path / "a.usdc")
-        assert not any(x.GetTimeSamples() for x in prim.GetAttributes())
+        assert {x.GetName() for x in prim.GetAttributes() if x.GetTimeSamples()} == {"gs4d:time"}
         np.testing.assert_allclose(np.array(prim.GetAttribute("positions").Get()), asset.at(0)[0], atol=1e-7)
         assert check_usd(tmp_path / "a.usdc") == [] and read_usd(tmp_path / "a.usdc").clip == asset.clip
 
