@@ -4,7 +4,7 @@
 from importlib import import_module
 
 # In the order in which they are registered; what comes later may use what comes before.
-MODULES = ("preferences", "settings", "importer", "jobs", "rigs", "reconstruct", "panel")
+MODULES = ("preferences", "settings", "importer", "jobs", "setup", "rigs", "reconstruct", "panel")
 
 
 def register() -> None:

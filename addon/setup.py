@@ -1,6 +1,210 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the preferences' buttons do: install the model runtime, take it away, test it."""
+"""The buttons in the preferences: install the model runtime, take it away, test it. Each is a Job (`jobs`); with
+`blender -b` the operators return when all is done. The network is asked only by Install, and only where Blender's
+own setting allows it.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+
+import bpy
+from bpy.props import EnumProperty
+
+from ..datagen.sequence import InputError
+from . import jobs, preferences, process, runtime
+
+BUILDS = [
+    ("cpu", "CPU", "Runs everywhere: about 300 MB to fetch, 1.3 GB on disk"),
+    ("cuda", "CUDA", "For NVIDIA GPUs: several GB to fetch, more on disk"),
+]
+OFFLINE = (
+    "Online access is off: to install the runtime switch it on under Preferences > System > Network > Allow Online "
+    "Access, or name above a Python that has timesplat[torch]."
+)
+SHOWN = ("numba", "numpy", "usd-core", "OpenEXR")
+TEXT = "Timesplat self-test"
+_job: jobs.Job | None = None  # the one that was started here last
+_report: list[str] = []  # the lines of the last self-test
+
+
+class _Button:
+    """An operator that starts a Job, and in background stays with it."""
+
+    def execute(self, context):
+        global _job
+        try:
+            if busy := jobs.running():
+                raise InputError(f"{busy[-1].label} runs; wait for its end, or cancel it.")
+            _job = self.start(context)
+            if bpy.app.background:
+                jobs.wait(_job)
+                self.report({"INFO"}, _job.message)
+        except InputError as e:
+            self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class TIMESPLAT_OT_install_runtime(_Button, bpy.types.Operator):
+    """Fetch torch and all else that reconstruction needs into a folder of the add-on's own"""
+
+    bl_idname = "timesplat.install_runtime"
+    bl_label = "Install Runtime"
+
+    build: EnumProperty(name="Build", items=BUILDS, default="cpu")
+
+    def invoke(self, context, event):
+        if not bpy.app.online_access:
+            self.report({"ERROR"}, OFFLINE)
+            return {"CANCELLED"}
+        return context.window_manager.invoke_props_dialog(self, width=420, confirm_text="Install")
+
+    def draw(self, context):
+        layout = self.layout
+        layout.row().prop(self, "build", expand=True)
+        about = next(about for key, _, about in BUILDS if key == self.build)
+        for line in (*textwrap.wrap(f"{about}.", 60), "Blender stays usable meanwhile, and Cancel is always possible."):
+            layout.label(text=line)
+
+    def start(self, context):
+        if not bpy.app.online_access:
+            raise InputError(OFFLINE)
+        if self.build == "cuda" and sys.platform == "darwin":
+            raise InputError("CUDA does not exist for this computer; choose CPU, which has Metal too.")
+        return jobs.start("Install runtime", [_stage({"task": "install", "build": self.build})], _installed)
+
+
+class TIMESPLAT_OT_uninstall_runtime(_Button, bpy.types.Operator):
+    """Remove the installed runtime from the disk"""
+
+    bl_idname = "timesplat.uninstall_runtime"
+    bl_label = "Uninstall Runtime"
+
+    @classmethod
+    def poll(cls, context):
+        return preferences.runtime() is not None
+
+    def invoke(self, context, event):
+        return context.window_manager.invoke_confirm(self, event)
+
+    def start(self, context):
+        return jobs.start("Uninstall runtime", [_stage({"task": "uninstall"})], _uninstalled)
+
+
+class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
+    """See whether this computer reconstructs: packages, device, checkpoints, a small scene"""
+
+    bl_idname = "timesplat.self_test"
+    bl_label = "Self-Test"
+
+    def start(self, context):
+        python = preferences.worker_python(context)
+        request = {"task": "selftest", "device": preferences.device(context)}
+        request["checkpoint"] = preferences.checkpoint(context)
+        return jobs.start("Self-test", [lambda folder: process.worker(python, request, folder)], _tested)
+
+
+def _stage(request: dict):
+    """A stage of a Job that runs `runtime` under Blender's own Python."""
+    request = {**request, "folder": str(preferences.runtime_folder())}
+    command = [sys.executable, "-I", str(Path(runtime.__file__))]
+    return lambda folder: process.Child(command, {**request, "work": str(folder)}, folder)
+
+
+def _installed(event: dict, folder: Path) -> str:
+    preferences.look_again()
+    return f"Runtime installed: torch {event['versions']['torch']}, {_mega(event['bytes'])} on disk."
+
+
+def _uninstalled(event: dict, folder: Path) -> str:
+    preferences.look_again()
+    return f"Runtime removed: {_mega(event['bytes'])} freed."
+
+
+def _tested(event: dict, folder: Path) -> str:
+    _report[:] = [str(line) for line in event["report"]]
+    text = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
+    text.from_string("\n".join(_report) + "\n")
+    failed = sum(not line.startswith("ok") for line in _report)
+    if bpy.app.background:
+        print(text.as_string())
+    else:
+        bpy.context.window_manager.popup_menu(
+            lambda menu, context: _lines(menu.layout), title=TEXT, icon="ERROR" if failed else "CHECKMARK"
+        )
+    if failed:
+        raise InputError(f"Self-test: {failed} of {len(_report)} failed; the text {TEXT!r} says what to do.")
+    return f"Self-test: all {len(_report)} passed."
+
+
+def _mega(count: int) -> str:
+    return f"{count / 1e6:.0f} MB"
+
+
+# ---------------------------------------------------------------- in the preferences
 
 
 def draw(layout) -> None:
-    """The part of the preferences below the settings."""
+    """The part of the preferences below the settings; reads no files."""
+    box = layout.box()
+    box.use_property_split = False
+    told = preferences.runtime()
+    if told:
+        versions = told["versions"]
+        text = f"Runtime: torch {versions.get('torch')} ({told['build'].upper()}), {_mega(told['bytes'])}"
+        box.label(text=text, icon="CHECKMARK")
+        box.label(text=", ".join(f"{k} {v}" for k, v in versions.items() if k in SHOWN), icon="BLANK1")
+    else:
+        box.label(text="Runtime: not installed", icon="IMPORT")
+    if not bpy.app.online_access:
+        for i, line in enumerate(textwrap.wrap(OFFLINE, 70)):
+            box.label(text=line, icon="BLANK1" if i else "INTERNET_OFFLINE")
+    row = box.row(align=True)
+    row.operator_context = "INVOKE_DEFAULT"
+    if jobs.running():
+        row.enabled = False
+    row.operator("timesplat.install_runtime", text="Install Again" if told else "Install Runtime", icon="IMPORT")
+    row.operator("timesplat.uninstall_runtime", text="Uninstall", icon="TRASH")
+    row.operator("timesplat.self_test", icon="CHECKMARK")
+    if _job in jobs.JOBS:
+        _progress(box)
+    _lines(box)
+
+
+def _progress(box) -> None:
+    row = box.row(align=True)
+    if _job.state == "running":
+        row.progress(factor=_job.fraction, text=f"{_job.label}: {_job.text}")
+        row.operator("timesplat.cancel", text="", icon="X").number = _job.number
+    else:
+        column = row.column()
+        for i, line in enumerate(textwrap.wrap(_job.message or _job.text, 70)):
+            column.label(text=line, icon="BLANK1" if i else jobs.ICONS[_job.state])
+        if _job.state == "waiting":
+            row.operator("timesplat.bring", text="", icon="IMPORT").number = _job.number
+    row.operator("timesplat.log", text="", icon="TEXT").number = _job.number
+
+
+def _lines(layout) -> None:
+    for line in _report:
+        for i, part in enumerate(textwrap.wrap(line, 80)):
+            layout.label(text=part, icon="BLANK1" if i else "CHECKMARK" if line.startswith("ok") else "ERROR")
+
+
+CLASSES = (TIMESPLAT_OT_install_runtime, TIMESPLAT_OT_uninstall_runtime, TIMESPLAT_OT_self_test)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    global _job
+    _job = None
+    _report.clear()
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
