@@ -30,8 +30,6 @@ from ..datagen.scene import normalisation
 from ..datagen.sequence import InputError, Normalisation
 from . import process
 
-FULL = "no space is left on the disk; make room there"
-
 
 def shoot(request: dict, folder: Path) -> process.Child:
     """Saves a copy of the open file into the folder (nothing of the session changes, not its name either) and
@@ -42,7 +40,8 @@ def shoot(request: dict, folder: Path) -> process.Child:
         # without what other add-ons do when a file is saved: this is not the artist's saving
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), copy=True, compress=False, relative_remap=True)
     except RuntimeError as e:
-        why = FULL if _full(folder) else " ".join(str(e).split())  # Blender says "no such file" then
+        full = shutil.disk_usage(folder).free < 1 << 20  # Blender says "no such file" then
+        why = "no space is left on the disk; make room there" if full else " ".join(str(e).split())
         raise InputError(f"{blend}: the copy to render from cannot be written: {why}.") from None
     request = request | {"blend": str(blend), "scripts": not bpy.app.autoexec_fail}
     code = process.launch("addon.capture")
@@ -109,16 +108,10 @@ def main() -> int:
         return 1
     except Exception as e:
         traceback.print_exc()
-        folder = Path(request["sequence"]).parent
-        why = f"{folder}: {FULL}" if _full(folder) else f"{type(e).__name__}: {' '.join(str(e).split())[:300]}"
-        say("error", message=f"Rendering stopped. {why}.")
+        why = " ".join(str(e).split())[:300]
+        say("error", message=f"Rendering stopped with {type(e).__name__}: {why}")
         return 1
     return 0
-
-
-def _full(folder: Path) -> bool:
-    """Whether the disk is; files that were cut short are reported as many things."""
-    return shutil.disk_usage(folder).free < 1 << 20
 
 
 def _leave_when_stdin_closes() -> None:

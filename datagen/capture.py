@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
+import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from itertools import groupby
@@ -121,7 +122,12 @@ def capture(
                 for file in cameras.render(tmp):
                     view = seq.views[done]
                     name = f"{_plain(view.rig)}_{_plain(view.camera)}_{view.frame:04d}"
-                    channels = read_multilayer(file)
+                    try:
+                        channels = read_multilayer(file)
+                    except (ValueError, OSError, struct.error, IndexError, KeyError):
+                        raise InputError(
+                            f"{tmp}: Blender did not write the picture whole; make space on that disk."
+                        ) from None
                     view.image = f"images/{name}.png"
                     write_png(folder / view.image, straight_srgb(channels["combined"]))
                     if passes:
