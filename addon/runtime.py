@@ -250,7 +250,10 @@ def _why(lines: list[str], work: Path) -> str:
         )
     here = f"Python {sys.version_info.major}.{sys.version_info.minor} on {sysconfig.get_platform()}"
     if found := re.findall(r"No matching distribution found for ([\w.-]+)", text):
-        return f"The package index has no {found[-1]} for {here}; try another version of Blender, {ELSEWHERE}."
+        return (
+            f"The package index has no {found[-1]} for {here}, or does not answer; check pip's configuration, try "
+            f"another version of Blender, {ELSEWHERE}."
+        )
     errors = [x for x in lines if x.startswith("ERROR:")] or [x for x in lines if x] or ["it said nothing"]
     return f"pip could not install the packages: {errors[-1].removeprefix('ERROR:').strip()[:300]} (see the log)."
 

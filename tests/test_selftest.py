@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The self-test's lines where all is well and where something is broken, and the scene that it is about."""
 
+import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -44,6 +47,17 @@ def test_a_broken_checkpoint_is_named_and_the_rest_is_tried(tmp_path):
     assert "copy or train it again" in lines["checkpoints"]
     assert lines["network"] == "FAILED: network: not tried; see checkpoints."
     assert [n for n in NAMES if lines[n].startswith("FAILED")] == ["checkpoints", "network"]
+
+
+def test_the_worker_hands_the_report_over():
+    """Of a device that is not there, which ends soon."""
+    request = json.dumps({"task": "selftest", "device": "nonsense", "checkpoint": "nowhere.safetensors"})
+    command = [sys.executable, "-m", "timesplat.model.worker"]
+    run = subprocess.run(command, input=request + "\n", capture_output=True, text=True, timeout=120)
+    events = [json.loads(line) for line in run.stdout.splitlines()]
+    assert run.returncode == 0 and [e["event"] for e in events] == ["progress"] * len(NAMES) + ["done"]
+    lines = by_name(events[-1]["report"])
+    assert lines["device"].startswith("FAILED: device: nonsense: torch cannot") and lines["lift"].startswith("ok")
 
 
 def test_a_checkpoint_of_ones_own_is_told_and_not_judged(tmp_path, monkeypatch):
