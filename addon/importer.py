@@ -130,7 +130,7 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         try:
             paths = self.paths()
             loaded = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
-        except InputError as e:
+        except (InputError, OSError) as e:  # the latter: no room for temporary files
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
         asset, path = loaded.asset, paths[0]

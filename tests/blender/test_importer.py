@@ -14,7 +14,9 @@ from timesplat.model.asset import ARRAYS, VISIBLE, read_ply, write_ply
 from .helpers import make
 
 IMPORT = """
+import atexit
 part("addon").register()
+atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
 display = part("addon.display")
 def load(**options):
     try:

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""File > Export > 4D Gaussians: the active asset object as .ply, .splat or USD, where and as it is now.
+
+    bpy.ops.timesplat.export_asset(filepath="a.usdz", half=True)          the suffix says the format
+    bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame
+
+What the sliders do and what was deleted is in the file, and so is the object's place in the world at the current
+frame. USD is written with the pxr of this Python, or by the worker in Blenders that have none.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, StringProperty
+
+from ..datagen.sequence import InputError
+from ..model import formats, usd
+from ..model.asset import Asset, atomic, write_ply
+from . import display, edit, preferences, process
+
+REPORT = "Timesplat USD report"
+SUFFIX = {"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz", "SLICE": ".ply", "SPLAT": ".splat"}
+SUFFIX |= {"SLICES": ""}
+FORMAT_ITEMS = [
+    ("PLY", "4D .ply", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
+    ("USDC", "USD, Binary (.usdc)", "For pipelines"),
+    ("USDA", "USD, Text (.usda)", "Large; to look into"),
+    ("USDZ", "USD, Package (.usdz)", "One file with all it needs"),
+    ("SLICE", "3DGS .ply, This Frame", "For 3DGS viewers and tools: what is visible at the current frame"),
+    ("SPLAT", ".splat, This Frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
+    ("SLICES", "3DGS .ply, All Frames", "A new folder with a .ply for every frame of the clip"),
+]
+MODE_ITEMS = [
+    ("splats", "Splats", "A Gaussian splat prim, which older readers take as points"),
+    ("points", "Points", "A points prim only, for files that are referenced into others and for older readers"),
+    ("frames", "Splats, Every Frame", "Positions at every frame, for readers that do not interpolate"),
+]
+
+
+def present(ob, apply_sliders: bool) -> Asset:
+    """The asset as the object shows it now, with its place in the world in the clip (see `formats.placed`).
+    Raises InputError."""
+    asset = edit.applied(ob) if apply_sliders else edit.asset_of(ob)
+    bpy.context.view_layer.update()  # a script may have moved it just now
+    matrix, clip = np.array(ob.matrix_world), asset.clip
+    own = np.diag([clip.scale, clip.scale, clip.scale, 1.0])
+    own[:3, 3] = clip.translation
+    if np.allclose(matrix, own, rtol=1e-6, atol=1e-6 * clip.scale):
+        return asset  # it was not moved: the clip's numbers are exacter than the object's
+    return formats.placed(asset, matrix)
+
+
+def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, context) -> list[str]:
+    """Writes and validates; returns what the validators complain about. Raises InputError."""
+    if importlib.util.find_spec("pxr"):
+        usd.write_usd(path, asset, mode=mode, half=half, original=original)
+        return usd.check_usd(path)
+    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+        copy = Path(folder) / "asset.ply"
+        write_ply(copy, asset)
+        request = {"task": "export", "asset": str(copy), "out": str(path.resolve()), "mode": mode, "half": half}
+        request |= {"original": str(original)} if original else {}
+        return process.ask(preferences.worker_python(context), request)["complaints"]
+
+
+@contextmanager
+def original_usd(ob, path: Path, frames: range, context):
+    """Yields a .usdc of the objects that the asset was made from, over these frames: a temporary one for a .usdz, which
+    takes it in, else <name>_original.usdc beside `path`, which refers to it. Raises InputError."""
+    if path.suffix.lower() == ".usdz":
+        with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+            _export_original(ob, Path(folder) / "original.usdc", frames, context)
+            yield Path(folder) / "original.usdc"
+        return
+    beside = path.with_name(f"{path.stem}_original.usdc")
+    new = not beside.exists()
+    with atomic(beside) as tmp:
+        _export_original(ob, tmp, frames, context)
+    try:
+        yield beside
+    except InputError:
+        if new:
+            beside.unlink(missing_ok=True)
+        raise
+
+
+def _export_original(ob, path: Path, frames: range, context) -> None:
+    """Blender's own USD export; selection, visibility and frame range are afterwards as they were."""
+    if not bpy.app.build_options.usd:
+        raise InputError("This Blender was built without USD, which With Original needs; switch that off.")
+    layer, scene = context.view_layer, context.scene
+    objects = [layer.objects[n] for n in ob.get("timesplat_source", []) if n in layer.objects]
+    if not objects:
+        raise InputError(f"{ob.name}: what it was made from is not in this view layer; switch With Original off.")
+    before = [(o, o.hide_get(), o.hide_viewport) for o in objects]
+    selected, active = list(layer.objects.selected), layer.objects.active
+    span, now = (scene.frame_start, scene.frame_end), (scene.frame_current, scene.frame_subframe)
+    why = "see its console"
+    try:
+        for o in selected:
+            o.select_set(False)
+        for o in objects:
+            o.hide_viewport = False
+            o.hide_set(False)
+            o.select_set(True)
+        scene.frame_start, scene.frame_end = frames.start, frames.stop - 1
+        bpy.ops.wm.usd_export(
+            filepath=str(path),
+            selected_objects_only=True,
+            export_animation=True,
+            export_armatures=False,  # deformed meshes at every frame, which every reader shows
+            export_shapekeys=False,
+            convert_world_material=False,
+        )
+    except RuntimeError as e:
+        why = " ".join(str(e).split())
+    finally:
+        scene.frame_start, scene.frame_end = span
+        scene.frame_set(now[0], subframe=now[1])
+        for o, hidden, off in before:
+            o.select_set(False)
+            o.hide_set(hidden)
+            o.hide_viewport = off
+        for o in selected:
+            o.select_set(True)
+        layer.objects.active = active
+    if not path.is_file():
+        raise InputError(
+            f"{ob.name}: Blender could not export what it was made from ({why}); do without it."
+        )
+
+
+def with_suffix(filepath: str, kind: str) -> str:
+    """The path with the format's suffix, in place of another format's."""
+    path = Path(filepath)
+    if path.suffix.lower() in SUFFIX.values():
+        filepath = str(path.with_suffix(""))
+    return filepath + SUFFIX[kind]
+
+
+class TIMESPLAT_OT_export_asset(bpy.types.Operator):
+    """Export the active 4D Gaussian asset: as .ply or .splat, or as USD"""
+
+    bl_idname = "timesplat.export_asset"
+    bl_label = "Export 4D Gaussians"
+    bl_options = {"PRESET"}  # noqa: RUF012
+
+    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    check_existing: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_glob: StringProperty(default="*.ply;*.splat;*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"})
+    format: EnumProperty(name="Format", items=FORMAT_ITEMS, default="PLY")
+    apply_sliders: BoolProperty(
+        name="Apply Sliders",
+        description="Retiming, crop, density, lifetimes and opacity cut go into the file. Off: all the object holds",
+        default=True,
+    )
+    mode: EnumProperty(name="Mode", items=MODE_ITEMS, default="splats")
+    half: BoolProperty(
+        name="Half Precision",
+        description="All but positions and opacities in 16 bits: a smaller file",
+        default=False,
+    )
+    with_original: BoolProperty(
+        name="With Original",
+        description="Also the objects that the asset was made from, as the other variant of a variant set",
+        default=False,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        cls.poll_message_set("Select a Timesplat asset, in Object Mode")
+        return context.mode == "OBJECT" and display.is_asset(context.object)
+
+    def invoke(self, context, event):
+        if not self.filepath:
+            folder = Path(bpy.data.filepath).parent if bpy.data.filepath else Path()
+            self.filepath = str(folder / bpy.path.clean_name(context.object.name))
+        self.check(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def check(self, context):
+        path = with_suffix(self.filepath, self.format)
+        changed, self.filepath = path != self.filepath, path
+        return changed
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        layout.prop(self, "format")
+        layout.prop(self, "apply_sliders")
+        if self.format.startswith("USD"):
+            layout.prop(self, "mode")
+            layout.prop(self, "half")
+            row = layout.row()
+            row.enabled = bpy.app.build_options.usd and bool(context.object and context.object.get("timesplat_source"))
+            row.prop(self, "with_original")
+
+    def execute(self, context):
+        if not self.properties.is_property_set("format"):
+            kinds = [k for k, s in SUFFIX.items() if s == Path(self.filepath).suffix.lower()]
+            self.format = kinds[0] if kinds else "PLY"
+        try:
+            if not self.filepath:
+                raise InputError("No file was named; choose one.")
+            path = Path(bpy.path.abspath(with_suffix(self.filepath, self.format)))
+            asset = present(context.object, self.apply_sliders)
+            level, said = self.write(path, asset, context)
+        except (InputError, OSError) as e:  # the latter: no room for temporary files
+            self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        self.report({level}, f"{path.name}: {said}")
+        return {"FINISHED"}
+
+    def write(self, path: Path, asset: Asset, context) -> tuple[str, str]:
+        """-> the report's level and text."""
+        frame = context.scene.frame_current_final
+        if self.format == "PLY":
+            write_ply(path, asset)
+        elif self.format in ("SLICE", "SPLAT"):
+            return "INFO", f"{formats.write_slice(path, asset, frame)} Gaussians of frame {frame:g}."
+        elif self.format == "SLICES":
+            return "INFO", f"{formats.write_slices(path, asset, path.name)} files."
+        elif self.with_original:
+            with original_usd(context.object, path, asset.clip.frames, context) as original:
+                return self.write_usd(path, asset, original, context)
+        else:
+            return self.write_usd(path, asset, None, context)
+        return "INFO", f"{len(asset)} Gaussians."
+
+    def write_usd(self, path: Path, asset: Asset, original: Path | None, context) -> tuple[str, str]:
+        complaints = write_usd(path, asset, mode=self.mode, half=self.half, original=original, context=context)
+        verdict = f"{len(complaints)} complaints" if complaints else "valid USD"
+        text = bpy.data.texts.get(REPORT) or bpy.data.texts.new(REPORT)
+        lines = [str(path), f"{len(asset)} Gaussians, mode {self.mode}, {path.stat().st_size:,} bytes", verdict]
+        text.from_string("\n".join([*lines, "", *complaints]).rstrip() + "\n")
+        if complaints:
+            return "WARNING", f'{len(asset)} Gaussians, {verdict}: see the text "{REPORT}".'
+        return "INFO", f"{len(asset)} Gaussians, {verdict}."
+
+
+def _menu(self, context):
+    self.layout.operator("timesplat.export_asset", text="4D Gaussians (.ply, .splat, .usd)")
+
+
+def register() -> None:
+    bpy.utils.register_class(TIMESPLAT_OT_export_asset)
+    bpy.types.TOPBAR_MT_file_export.append(_menu)
+
+
+def unregister() -> None:
+    bpy.types.TOPBAR_MT_file_export.remove(_menu)
+    bpy.utils.unregister_class(TIMESPLAT_OT_export_asset)
