@@ -184,6 +184,7 @@ def export_arguments(p: argparse.ArgumentParser) -> None:
                    "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
     p.add_argument("--half", action="store_true", help="USD: half precision")
     p.add_argument("--original", type=Path, help="USD: file of the original object, for a variant set")
+    p.add_argument("--original-start", type=float, help="its frame at the clip's first frame (default: the same frame)")
     p.add_argument("--check", action="store_true", help="USD: exit with 1 if the validator complains")
     p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply or .splat")
     p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a 3DGS .ply a frame into a new folder")
@@ -213,7 +214,8 @@ def export(args: argparse.Namespace) -> int:
     if args.frame is not None:
         count = write_slice(args.out, asset, args.frame)
     elif usd:
-        write_usd(args.out, asset, mode=args.mode, half=args.half, original=args.original)
+        more = {"original": args.original, "original_start": args.original_start}
+        write_usd(args.out, asset, mode=args.mode, half=args.half, **more)
     elif args.out.suffix.lower() == ".ply":
         write_ply(args.out, asset)
     elif args.out.suffix.lower() == ".blend":

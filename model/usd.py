@@ -56,6 +56,7 @@ def write_usd(
     mode: str = "splats",
     half: bool = False,
     original: str | Path | None = None,
+    original_start: float | None = None,
 ) -> None:
     """Writes .usd/.usdc (binary), .usda (text) or .usdz (package); whole or not at all.
 
@@ -67,9 +68,9 @@ def write_usd(
               object's half-side, opacities gain nothing; scales and lifetimes below 2^-14 are raised to it,
               lifetimes above 65504 lowered)
     original  USD file of the object that was reconstructed: the default prim gets a variant set `representation`
-              with `reconstruction` (selected) and `original`, which lies over it, frame on frame. A .usdz takes
-              in the original and the files it needs, all from the original's folder; other files refer to it
-              by its relative path.
+              with `reconstruction` (selected) and `original`, which lies over it. A .usdz takes in the original
+              and the files it needs, all from the original's folder; others refer to it by its relative path.
+    original_start  its time code at the clip's first frame (default: that frame)
     Raises InputError: wrong suffix or mode, bad arrays, the disk, an original that cannot be used."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -83,7 +84,8 @@ def write_usd(
         package = Path(folder) / "package.usdz" if path.suffix.lower() == ".usdz" else None
         inner = Path(folder) / "splats.usdc" if package else tmp
         if original is not None:
-            _add_original(stage.GetRootLayer(), Path(original), path, Path(folder))
+            shift = 0 if original_start is None else asset.clip.frame_start - original_start
+            _add_original(stage.GetRootLayer(), Path(original), shift, path, Path(folder))
         try:
             ok = stage.GetRootLayer().Export(str(inner))
             if package:
@@ -97,9 +99,9 @@ def write_usd(
         old.Reload(force=True)
 
 
-def _add_original(layer, original: Path, path: Path, folder: Path) -> None:
-    """Puts the original into the variant ORIGINAL, turned and scaled to Z-up metres and with its time codes as they
-    are (a reference would convert them from its frame rate to ours)."""
+def _add_original(layer, original: Path, shift: float, path: Path, folder: Path) -> None:
+    """Puts the original into the variant ORIGINAL, turned and scaled to Z-up metres and with its time codes later by
+    `shift` (a reference alone would also convert them from its frame rate to ours)."""
     Gf, Sdf, _, UsdGeom, UsdUtils, Vt = pxr()
     source = open_stage(original)
     if path.exists() and path.samefile(original):
@@ -115,7 +117,9 @@ def _add_original(layer, original: Path, path: Path, folder: Path) -> None:
         if original.suffix.lower() == ".usdz":
             original = _unpacked(original, folder)
         home = original.parent.resolve()
-        layers, files, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(original)))
+        layers, files, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(original)))
+        if missing:
+            raise InputError(f"{original}: it refers to {missing[0]}, which is not there; find it or write a .usdc.")
         for name in [x.realPath for x in layers] + list(files):
             if not Path(name).resolve().is_relative_to(home):
                 raise InputError(f"{original}: it refers to {name}, outside of its own folder; copy that beside it.")
@@ -140,7 +144,7 @@ def _add_original(layer, original: Path, path: Path, folder: Path) -> None:
     child.kind = "subcomponent"
     rate = source.GetTimeCodesPerSecond() / layer.timeCodesPerSecond
     root = Sdf.Path() if prim else roots[0].GetPath()
-    child.referenceList.prependedItems.append(Sdf.Reference(where, root, Sdf.LayerOffset(0, rate)))
+    child.referenceList.prependedItems.append(Sdf.Reference(where, root, Sdf.LayerOffset(shift, rate)))
 
 
 def _relative(original: Path, path: Path) -> str:
@@ -188,7 +192,7 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path, variants: bool):
     with contextlib.ExitStack() as stack:
         if variants:
             choice = root.GetVariantSets().AddVariantSet(VARIANTS)
-            for name in (ORIGINAL, RECONSTRUCTION):
+            for name in (RECONSTRUCTION, ORIGINAL):
                 choice.AddVariant(name)
             choice.SetVariantSelection(RECONSTRUCTION)
             stack.enter_context(choice.GetVariantEditContext())

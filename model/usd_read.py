@@ -119,18 +119,15 @@ def _read_4d(path: Path, stage, prim) -> Asset:
         pixel = float(prim.GetCustomDataByKey("timesplat:pixel") or 0)
         start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
         if prim.HasAttribute("gs4d:time"):
-            time = prim.GetAttribute("gs4d:time")
-            start, end = time.GetTimeSamples()[0], time.GetTimeSamples()[-1]
-            if time.Get(start) > 0:
-                start, end = end, start
+            start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # once, where the clip is one frame
     except (TypeError, ValueError, IndexError, RuntimeError):
         raise InputError(f"{path}: orientations or gs4d:time are damaged; export it again.") from None
     t, velocity, sigma_t = (get(f"primvars:gs4d:{name}") for name in ("mu_t", "velocity", "sigma_t"))
-    first, last = int(np.floor(min(start, end) + 1e-6)), int(np.ceil(max(start, end) - 1e-6))
-    if last > first and (first, last) != (start, end):  # retimed to fractional frames, or backwards
+    first, last = int(np.floor(start + 1e-6)), int(np.ceil(end - 1e-6))
+    if last > first and (first, last) != (start, end):  # retimed to fractional frames
         stretch = np.float32((end - start) / (last - first))
         t = (t + 1) * stretch + np.float32(2 * (start - first) / (last - first) - 1)
-        velocity, sigma_t = velocity / stretch, sigma_t * np.abs(stretch)
+        velocity, sigma_t = velocity / stretch, sigma_t * stretch
     return Asset(
         xyz=get("primvars:gs4d:position"),
         t=t,

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sizes and seconds of an asset's USD files, as a table: `python benchmarks/usd.py ASSET.ply [--count N]`.
+
+For every mode, in full and half precision, as .usdc (a .usdz is a few hundred bytes larger, a .usda is text).
+Processor seconds of one process, the least of three calls, import of pxr not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from timesplat.model.asset import ARRAYS, Asset, read_ply
+from timesplat.model.tables import machine
+from timesplat.model.usd import MODES, check_usd, read_usd, write_usd
+
+
+def least(call: Callable[[], object]) -> float:
+    """Processor seconds, the least of three calls."""
+    taken = []
+    for _ in range(3):
+        start = time.process_time()
+        call()
+        taken.append(time.process_time() - start)
+    return min(taken)
+
+
+def rows(asset: Asset) -> list[str]:
+    lines = ["| mode | precision | MB | write | check | read back |", "|---|---|---|---|---|---|"]
+    with tempfile.TemporaryDirectory() as folder:
+        for mode in MODES:
+            for half in (False, True):
+                path = Path(folder) / f"{mode}{half}.usdc"
+                write = least(lambda path=path, mode=mode, half=half: write_usd(path, asset, mode=mode, half=half))
+                if complaints := check_usd(path):
+                    raise SystemExit("\n".join(complaints))
+                check, read = least(lambda path=path: check_usd(path)), least(lambda path=path: read_usd(path))
+                lines.append(
+                    f"| {mode} | {'half' if half else 'full'} | {path.stat().st_size / 1e6:.1f} "
+                    f"| {write:.2f} s | {check:.2f} s | {read:.2f} s |"
+                )
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("asset", type=Path)
+    parser.add_argument("--count", type=int, help="take so many of its Gaussians, at random (seed 0)")
+    args = parser.parse_args()
+    asset = read_ply(args.asset)
+    if args.count:
+        some = np.sort(np.random.default_rng(0).permutation(len(asset))[: args.count])
+        asset = replace(asset, **{k: getattr(asset, k)[some] for k in ARRAYS})
+    print(f"{len(asset)} Gaussians, {len(asset.clip.frames)} frames; {machine()['cpu']}\n")
+    print("\n".join(rows(asset)))
+
+
+if __name__ == "__main__":
+    main()
