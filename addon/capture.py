@@ -5,7 +5,8 @@ So rendering never blocks Blender, nothing of the open scene can change, and to 
 `shoot` starts it (under the add-on); `main` is what runs in it, and speaks as `process` says. The request:
     blend      copy of the file                     scripts    whether the scripts in it may run
     scene, layer   names of the scene and of its view layer
-    objects    names of what is captured            cameras    names of cameras, or [] for canonical views in turn
+    objects    names of what is captured            cameras    names of cameras, or [] for those of `rig`
+    rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
     frames     scene frames                         in_turn    one camera a frame, instead of all of them
     size, samples, passes, lighting                 as `datagen.capture.capture` has them
     sequence   folder to write
@@ -26,24 +27,27 @@ import numpy as np
 
 from ..datagen import rigs
 from ..datagen.capture import capture
-from ..datagen.scene import normalisation
+from ..datagen.scene import normalisation, versions
 from ..datagen.sequence import InputError, Normalisation
 from . import process
 
 
 def shoot(request: dict, folder: Path) -> process.Child:
     """Saves a copy of the open file into the folder (nothing of the session changes, not its name either) and
-    starts the process on it; adds "blend" and "scripts" to the request. Raises InputError where the copy cannot
-    be written."""
+    starts the process on it; adds "blend", "name" (of the artist's file) and "scripts" to the request. Raises
+    InputError where the copy cannot be written."""
     blend = folder / "scene.blend"
     try:
-        # without what other add-ons do when a file is saved: this is not the artist's saving
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), copy=True, compress=False, relative_remap=True)
     except RuntimeError as e:
         full = shutil.disk_usage(folder).free < 1 << 20  # Blender says "no such file" then
         why = "no space is left on the disk; make room there" if full else " ".join(str(e).split())
         raise InputError(f"{blend}: the copy to render from cannot be written: {why}.") from None
-    request = request | {"blend": str(blend), "scripts": not bpy.app.autoexec_fail}
+    request = request | {
+        "blend": str(blend),
+        "scripts": not bpy.app.autoexec_fail,
+        "name": Path(bpy.data.filepath).name,
+    }
     code = process.launch("addon.capture")
     program = bpy.app.binary_path  # empty where Blender is a Python module
     command = [program, "-b", "--factory-startup", "--python-exit-code", "1", "--python-expr", code]
@@ -74,16 +78,19 @@ def _capture(request: dict, say) -> int:
     frames = request["frames"]
     say("progress", fraction=0.02, text="measuring the object")
     norm, aabb = normalisation(frames, objects, name=scene.name)
-    if cameras:
+    numbers, seed, rig = range(len(frames)), request.get("seed", 0), request.get("rig")
+    if cameras and not rig:
         shots = camera_shots(scene, cameras, frames, norm, request["in_turn"])
     else:
-        shots = rigs.alternating(range(len(frames)))
+        shots = rigs.RIGS[rig or "alternating"](numbers, seed)
+    shots += rigs.targets(numbers, seed, request.get("targets", 0))
 
     def progress(done: int, total: int) -> None:
         say("progress", fraction=0.05 + 0.95 * done / total, text=f"rendering: picture {done} of {total}")
 
     settings = {key: request[key] for key in ("size", "samples", "passes", "lighting")}
     folder = Path(request["sequence"])
+    settings["provenance"] = {"asset": request["name"], **versions(), "scene_frames": frames}
     capture(shots, folder, frames=frames, normalisation=norm, aabb=aabb, objects=objects, progress=progress, **settings)
     return len(shots)
 

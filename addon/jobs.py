@@ -132,11 +132,13 @@ def start(
     return job
 
 
-def wait(job: Job) -> None:
-    """Stays with the Job until it has ended, for scripts and `blender -b`. Raises InputError if it failed."""
+def wait(job: Job, report: Callable[[Job], None] = lambda job: None) -> None:
+    """Stays with the Job until it has ended, for scripts and `blender -b`; `report` is called on the way. Raises
+    InputError if it failed."""
     try:
         while job.state == "running":
-            job.step(INTERVAL)
+            if job.step(INTERVAL):
+                report(job)
         if job.state == "waiting":
             job.bring()
     finally:

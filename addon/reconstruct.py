@@ -57,47 +57,51 @@ class TIMESPLAT_OT_reconstruct(settings.Settings, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def start(chosen, context) -> jobs.Job:
-    """Starts the Job that these settings ask for. Raises InputError before anything has been done."""
+def request(chosen, context) -> dict:
+    """What these settings ask of `capture`, but for the folder to write. Raises InputError."""
     scene = context.scene
-    python = preferences.worker_python(context)
-    frames = settings.frames(chosen, scene)
-    objects = settings.objects(chosen, context)
     cameras, _ = settings.cameras(context)
     for ob in cameras:
         if ob.data.type != "PERSP":
             raise InputError(f"{ob.name}: the camera is not a perspective one; change its type or unselect it.")
+    return {
+        "scene": scene.name,
+        "layer": context.view_layer.name,
+        "objects": [o.name for o in settings.objects(chosen, context)],
+        "cameras": [o.name for o in cameras],
+        "frames": settings.frames(chosen, scene),
+        "in_turn": chosen.in_turn,
+        "size": chosen.size,
+        "samples": chosen.samples,
+        "passes": getattr(chosen, "method", "") != "rgb",
+        "lighting": chosen.lighting,
+    }
+
+
+def start(chosen, context) -> jobs.Job:
+    """Starts the Job that these settings ask for. Raises InputError before anything has been done."""
+    python = preferences.worker_python(context)
+    shot = request(chosen, context)
+    frames = shot["frames"]
     checkpoint = bpy.path.abspath(chosen.checkpoint) if getattr(chosen, "checkpoint", "") else ""
     if checkpoint and not Path(checkpoint).is_file():
         raise InputError(f"{checkpoint}: no such checkpoint; correct it, or leave it empty.")
     output = _output(chosen.output)
     expected = settings.estimate(chosen, context)
     pixels = expected.pictures * chosen.size**2
-    begun = [time.monotonic()]
-    shot = {
-        "scene": scene.name,
-        "layer": context.view_layer.name,
-        "objects": [o.name for o in objects],
-        "cameras": [o.name for o in cameras],
-        "frames": frames,
-        "in_turn": chosen.in_turn,
-        "size": chosen.size,
-        "samples": chosen.samples,
-        "passes": chosen.method != "rgb",
-        "lighting": chosen.lighting,
-    }
+    begun = time.monotonic()
 
     def render(folder: Path) -> process.Child:
         return shoot(shot | {"sequence": str(folder / "sequence")}, folder)
 
     def reconstruct(folder: Path) -> process.Child:
-        settings.learn(time.monotonic() - begun[0], pixels, chosen_samples)
-        return process.worker(python, request | {k: str(folder / v) for k, v in places.items()}, folder)
+        settings.learn(time.monotonic() - begun, pixels, shot["samples"])
+        places = {"sequence": str(folder / "sequence"), "asset": str(folder / "asset.ply")}
+        return process.worker(python, asked | places, folder)
 
     # The operator is gone by the time that a stage or the end comes: what they need is taken from it now.
-    chosen_samples, look, lighting = chosen.samples, chosen.look, chosen.lighting
-    places = {"sequence": "sequence", "asset": "asset.ply"}
-    request = {
+    look = chosen.look
+    asked = {
         "task": "reconstruct",
         "method": chosen.method,
         "refine": chosen.refine,
@@ -105,18 +109,18 @@ def start(chosen, context) -> jobs.Job:
         "device": preferences.device(context),
         "checkpoint": checkpoint or preferences.checkpoint(context),
     }
-    names = [o.name for o in objects if o.type != "LIGHT"]
+    names = [n for n in shot["objects"] if context.scene.objects[n].type not in ("LIGHT", "CAMERA")]
 
     def finish(event: dict, folder: Path) -> str:
         # the Sequence counts frames from 0; in this scene the clip lies where it was taken from
         asset = read_ply(folder / "asset.ply")
         asset.clip = replace(asset.clip, frame_start=frames[0], frame_end=frames[-1])
         ob = display.add_asset(asset, "Timesplat", look=look, context=bpy.context)
-        ob["timesplat_source"], ob["timesplat_lighting"] = names, lighting
+        ob["timesplat_source"], ob["timesplat_lighting"] = names, shot["lighting"]
         roots = {n: o for n in names if (o := bpy.context.scene.objects.get(n)) and not o.parent}
-        if len(roots) == 1 and hasattr(display, "follow"):
+        if len(roots) == 1:
             display.follow(ob, next(iter(roots.values())))
-        said = f"{len(asset)} Gaussians in {time.monotonic() - begun[0]:.0f} s"
+        said = f"{len(asset)} Gaussians in {time.monotonic() - begun:.0f} s"
         if output:
             try:
                 write_ply(output, asset)
@@ -126,7 +130,7 @@ def start(chosen, context) -> jobs.Job:
 
     shares = [expected.rendering, expected.reconstructing]
     return jobs.start(
-        "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=scene.name
+        "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=shot["scene"]
     )
 
 

@@ -83,7 +83,7 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
         collection = bpy.data.collections.get(settings.RIG) or bpy.data.collections.new(settings.RIG)
         if settings.RIG not in scene.collection.children:
             scene.collection.children.link(collection)
-        for ob in context.selected_objects:
+        for ob in context.view_layer.objects.selected:
             ob.select_set(False)
         placed: dict[str, list] = {}
         for shot in shots(self.rig, self.count, math.degrees(self.elevation), self.distance, frames):

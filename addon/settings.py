@@ -115,7 +115,7 @@ def objects(settings, context) -> list:
     scene = context.scene
     shown = [o for o in shown_objects(scene, context.view_layer) if not o.get("timesplat")]
     if settings.source == "SELECTED":
-        family = {o.name for s in context.selected_objects for o in (s, *s.children_recursive)}
+        family = {o.name for s in context.view_layer.objects.selected for o in (s, *s.children_recursive)}
         shown = [o for o in shown if o.name in family or o.type == "LIGHT"]
     elif settings.source == "COLLECTION":
         collection = bpy.data.collections.get(settings.collection)
@@ -131,7 +131,7 @@ def objects(settings, context) -> list:
 def cameras(context) -> tuple[list, str]:
     """-> (camera objects to take pictures with, what to call them): the selected ones, else those of the rig,
     else none: canonical views in turn."""
-    selected = [o for o in context.selected_objects if o.type == "CAMERA"]
+    selected = [o for o in context.view_layer.objects.selected if o.type == "CAMERA"]
     if selected:
         return selected, f"{len(selected)} selected camera{'s' * (len(selected) > 1)}"
     rig = bpy.data.collections.get(RIG)
