@@ -4,7 +4,10 @@
 from importlib import import_module
 
 # In the order in which they are registered; what comes later may use what comes before.
-MODULES = ("preferences", "settings", "importer", "jobs", "setup", "rigs", "reconstruct", "panel")
+MODULES = (
+    *("preferences", "settings", "importer", "jobs", "setup", "rigs", "reconstruct", "commands", "panel"),
+    *("display", "edit", "compare", "exporter"),
+)
 
 
 def register() -> None:

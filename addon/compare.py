@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Original, reconstruction and their difference side by side, at the frame that is shown: `timesplat.compare`.
+
+Both are rendered by Cycles, small, in a throw-away copy of the scene, as the capture rendered what the asset was made
+from: with Even Light where that was on, over white, colours as they are. The picture is the image "Timesplat Compare".
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import IntProperty
+
+from ..datagen import capture
+from ..datagen.scene import borrowed, shown_objects
+from ..datagen.sequence import InputError
+from . import display, edit
+
+IMAGE = "Timesplat Compare"
+GAIN = 4  # the difference is shown this many times as strong
+
+
+def compare(ob, context=None, *, size: int = 256, samples: int = 16) -> tuple[np.ndarray, float]:
+    """(height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made from, the asset, GAIN
+    times their absolute difference; and the PSNR in dB over the whole picture. The view is the scene's camera's, or
+    without one the 3D view's; `size` pixels is its longer side. What the asset was made from are the objects that
+    `timesplat_source` names, else all that renders show but assets. Raises InputError where there is no view or
+    nothing to compare with."""
+    context = context or bpy.context
+    scene = context.scene
+    names = ob.get("timesplat_source")
+    if names is not None:
+        originals = [scene.objects[name] for name in names if name in scene.objects]
+    else:
+        originals = shown_objects(scene, context.view_layer)
+    originals = [o for o in originals if o.type not in ("CAMERA", "LIGHT") and not o.get("timesplat")]
+    if not originals:
+        raise InputError(f"{ob.name}: what it was made from is not in this scene; open the scene that has it.")
+    lights = [o for o in shown_objects(scene, context.view_layer) if o.type == "LIGHT"]
+    even = bool(ob.get("timesplat_lighting", True))
+    view = _camera(context)
+    try:
+        truth = _picture(context, [*originals, *lights], view, even, size, samples)
+        asset = _picture(context, [ob], view, even, size, samples)
+    finally:
+        bpy.data.cameras.remove(view[0])
+    error = float(((truth - asset) ** 2).mean())
+    psnr = -10 * math.log10(error) if error else math.inf
+    return np.concatenate([truth, asset, np.minimum(GAIN * np.abs(truth - asset), 1)], 1), psnr
+
+
+def _camera(context) -> tuple:
+    """(a camera, its matrix in the world, width, height in any unit); the camera is to be removed by the caller."""
+    scene, render = context.scene, context.scene.render
+    if scene.camera and scene.camera.type == "CAMERA":
+        data, matrix = scene.camera.data.copy(), scene.camera.matrix_world.copy()
+        return data, matrix, render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
+    for area in context.screen.areas if context.screen and not bpy.app.background else ():
+        if area.type != "VIEW_3D":
+            continue
+        space, region = area.spaces.active, next(r for r in area.regions if r.type == "WINDOW")
+        data = bpy.data.cameras.new("timesplat")
+        data.sensor_fit, data.sensor_width, data.lens = "AUTO", 72, space.lens  # the 3D view's sensor
+        data.clip_start, data.clip_end = space.clip_start, space.clip_end
+        if space.region_3d.view_perspective == "ORTHO":
+            data.type, data.ortho_scale = "ORTHO", space.region_3d.view_distance * 72 / space.lens
+        return data, space.region_3d.view_matrix.inverted(), region.width, region.height
+    raise InputError(f"{scene.name}: there is no camera and no 3D view to look through; add a camera.")
+
+
+def _picture(context, objects: list, view: tuple, even: bool, size: int, samples: int) -> np.ndarray:
+    """(H,W,3) float32, sRGB-encoded, over white: the objects, shown whether or not they are hidden."""
+    data, matrix, width, height = view
+    scale = size / max(width, height)
+    width, height = max(1, round(width * scale)), max(1, round(height * scale))
+    scene = context.scene
+    with tempfile.TemporaryDirectory() as tmp, capture._temporary() as made:
+        shown = []
+        for ob in objects:
+            if ob.get("timesplat") or ob.hide_render:
+                ob = ob.copy()
+                made.append(ob)
+                ob.hide_render = False
+                if modifier := display.sampler(ob):
+                    display.set_input(modifier, "Look", "Splats")
+            shown.append(ob)
+        with borrowed(shown, lights=not even) as stage:
+            capture._settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
+            if even:
+                capture._lights(stage, made)
+            stage.render.use_multiview = False
+            stage.cycles.transparent_max_bounces = 2 * display.TRANSPARENT_BOUNCES
+            camera = bpy.data.objects.new("timesplat", data)
+            made.append(camera)
+            camera.matrix_world = matrix
+            stage.collection.objects.link(camera)
+            stage.camera = camera
+            stage.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+            stage.render.filepath = str(Path(tmp) / "frame")
+            with bpy.context.temp_override(scene=stage):
+                bpy.ops.render.render(write_still=True)
+            rgba = capture.straight_srgb(capture.read_multilayer(Path(tmp) / "frame.exr")["combined"]) / np.float32(255)
+    return rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+
+
+def to_image(pixels: np.ndarray):
+    """The image datablock IMAGE with (H,W,3) sRGB-encoded values, rows from the top."""
+    height, width, _ = pixels.shape
+    image = bpy.data.images.get(IMAGE)
+    if image and tuple(image.size) != (width, height):
+        bpy.data.images.remove(image)
+        image = None
+    image = image or bpy.data.images.new(IMAGE, width, height)
+    rgba = np.concatenate([pixels, np.ones_like(pixels[..., :1])], 2)[::-1]
+    image.pixels.foreach_set(np.ascontiguousarray(rgba, np.float32).ravel())
+    image.update()
+    image.pack()
+    return image
+
+
+def show(image, context) -> None:
+    """Shows the image in an image editor: one that is open, else in a window of its own."""
+    if bpy.app.background or not context.window:
+        return
+    windows = context.window_manager.windows
+    areas = [a for w in windows for a in w.screen.areas if a.type == "IMAGE_EDITOR"]
+    if not areas:
+        bpy.ops.wm.window_new()
+        areas = [windows[-1].screen.areas[0]]
+        areas[0].type = "IMAGE_EDITOR"
+    areas[0].spaces.active.image = image
+    areas[0].tag_redraw()
+
+
+class TIMESPLAT_OT_compare(bpy.types.Operator):
+    """Render the original, the reconstruction and their difference at this frame, side by side"""
+
+    bl_idname = "timesplat.compare"
+    bl_label = "Compare"
+    bl_options = {"REGISTER"}  # noqa: RUF012
+
+    size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=256, min=16)
+    samples: IntProperty(name="Samples", description="Cycles samples a pixel", default=16, min=1)
+
+    poll = edit.TIMESPLAT_OT_delete.poll
+
+    def execute(self, context):
+        try:
+            pixels, psnr = compare(context.object, context, size=self.size, samples=self.samples)
+        except InputError as e:
+            self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        show(to_image(pixels), context)
+        self.report({"INFO"}, f"Original, reconstruction, {GAIN} times the difference: {psnr:.1f} dB PSNR.")
+        return {"FINISHED"}
+
+
+def register() -> None:
+    bpy.utils.register_class(TIMESPLAT_OT_compare)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(TIMESPLAT_OT_compare)
