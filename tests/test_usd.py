@@ -14,7 +14,7 @@ pytest.importorskip("pxr")
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from timesplat.datagen.sequence import InputError
-from timesplat.model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, linear_from_srgb
+from timesplat.model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, linear_from_srgb, rotation_matrices
 from timesplat.model.usd import BOX, PRIM, check_usd, read_usd, write_usd
 from timesplat.model.usd_read import SPLAT
 
@@ -187,6 +187,8 @@ def test_sizes(tmp_path):
         ("primvars:gs4d:mu_t", lambda v: v * np.nan, "NaN"),
         ("extent", lambda v: v * 0.1, "leave the extent"),
         ("positions", lambda v: v[:0], "empty"),
+        ("positions", lambda v: v * 0.5, "positions and points differ"),
+        ("primvars:displayOpacity", lambda v: v * 0.5, "opacities and primvars:displayOpacity differ"),
     ],
 )
 def test_check_usd_complains(tmp_path, attribute, edit, word):
@@ -239,6 +241,131 @@ def test_errors_are_one_sentence(tmp_path):
         a.sigma_t[3] = 10
         write_usd(tmp_path / "nan.usdc", a)
     assert sorted(os.listdir(tmp_path)) == ["bad.usdc", "empty.usda"]
+
+
+# ---------------------------------------------------------------- stages and files that are not ours
+
+
+def others(path, *, frames=(None,), half=False, degree=1, **leave_out):
+    """A splat file as another program might write it: three splats, SH of a degree, Y up, 10 cm to the unit."""
+    h, r = "h" * half, np.random.default_rng(1)
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.1)
+    prim = stage.DefinePrim("/scan", SPLAT)
+    three, four = (Vt.Vec3hArray, Vt.QuathArray) if half else (Vt.Vec3fArray, Vt.QuatfArray)
+    kinds = Sdf.ValueTypeNames
+    at = {f: r.uniform(-1, 1, (3, 3)).astype(np.float32) for f in frames}
+    for frame, xyz in at.items():
+        code = Usd.TimeCode.Default() if frame is None else frame
+        prim.CreateAttribute("positions", kinds.Point3fArray).Set(Vt.Vec3fArray.FromNumpy(xyz), code)
+    scale, sh = np.array([[1, 2, 3]] * 3) / 100, r.normal(0, 0.3, (3 * (degree + 1) ** 2, 3))
+    dtype = np.float16 if half else np.float32
+    values = {
+        "scales": (kinds.Half3Array if half else kinds.Float3Array, three.FromNumpy(scale.astype(dtype))),
+        "orientations": (
+            kinds.QuathArray if half else kinds.QuatfArray,
+            four.FromNumpy(np.tile([0, 0, 0, 2], (3, 1)).astype(dtype)),
+        ),
+        "opacities": (
+            kinds.HalfArray if half else kinds.FloatArray,
+            (Vt.HalfArray if half else Vt.FloatArray).FromNumpy(np.array([0.5, 0.75, 1], dtype)),
+        ),
+        "radiance:sphericalHarmonicsCoefficients": (
+            kinds.Half3Array if half else kinds.Float3Array,
+            three.FromNumpy(sh.astype(dtype)),
+        ),
+    }
+    for name, (kind, value) in values.items():
+        if name not in leave_out:
+            prim.CreateAttribute(name + h, kind).Set(value)
+    stage.Save()
+    return at, sh
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_still_splats_of_another_program(tmp_path, half, degree):
+    at, sh = others(tmp_path / "a.usda", half=half, degree=degree)
+    asset = read_usd(tmp_path / "a.usda")
+    x, y, z = at[None].T * 0.1
+    np.testing.assert_allclose(
+        asset.xyz * asset.clip.scale + asset.clip.translation, np.stack([x, -z, y], 1), atol=1e-6
+    )
+    matrices = rotation_matrices(asset.rotation) * (asset.scale * asset.clip.scale)[:, None, :]
+    expected = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) * [0.001, 0.002, 0.003]
+    np.testing.assert_allclose(
+        matrices @ matrices.transpose(0, 2, 1), [expected @ expected.T] * 3, rtol=2e-3, atol=1e-9
+    )
+    np.testing.assert_allclose(asset.rgb, 0.5 + 0.28209479 * sh[:: (degree + 1) ** 2], atol=1e-3)
+    np.testing.assert_allclose(asset.opacity, [0.5, 0.75, 1])
+    np.testing.assert_array_equal(asset.at(1)[0], asset.at(-1)[0])
+    np.testing.assert_array_equal(asset.at(1)[1], asset.at(-1)[1])
+
+
+def test_moving_splats_of_another_program_live_for_a_frame_each(tmp_path):
+    at, _ = others(tmp_path / "a.usda", frames=(3, 5))
+    asset = read_usd(tmp_path / "a.usda")
+    assert len(asset) == 9 and asset.clip.frames == range(3, 6)
+    for frame, expected in ((3, at[3]), (4, (at[3] + at[5]) / 2), (5, at[5])):
+        position, opacity = asset.at(asset.frame_to_time(frame))
+        seen = opacity > 0.05
+        x, y, z = expected.T * 0.1
+        world = position[seen] * asset.clip.scale + asset.clip.translation
+        np.testing.assert_allclose(world, np.stack([x, -z, y], 1), atol=1e-6)
+        np.testing.assert_allclose(opacity[seen], [0.5, 0.75, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("edit", "word"),
+    [
+        (lambda stage, prim: prim.RemoveProperty("opacities"), "opacities is missing at /scan"),
+        (lambda stage, prim: prim.GetAttribute("positions").Set([(0, 0, 0)] * 5), "cannot belong to 5 splats"),
+        (lambda stage, prim: prim.GetAttribute("positions").Set([]), "cannot belong to 0 splats"),
+        (lambda stage, prim: prim.GetAttribute("opacities").Set([2, 2, 2]), "opacity leaves the range"),
+        (lambda stage, prim: prim.GetAttribute("opacities").Set([1, 1]), "opacity is not a float32 array"),
+        (lambda stage, prim: UsdGeom.Xformable(prim).AddScaleOp().Set((0, 1, 1)), "/scan is scaled to nothing"),
+        (lambda stage, prim: UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, 1), 3), None),
+        (lambda stage, prim: [UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, f), f) for f in (1,)]
+         and [prim.GetAttribute("xformOp:translate").Set((0, 1, f), f) for f in (2, 3)], "/scan moves over time"),
+        (lambda stage, prim: stage.DefinePrim("/scan2", SPLAT), "holds 2 assets (/scan, /scan2)"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_told_in_a_sentence(tmp_path, edit, word):
+    others(tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    edit(stage, stage.GetPrimAtPath("/scan"))
+    stage.Save()
+    if word is None:
+        assert len(read_usd(tmp_path / "a.usda")) == 3
+        return
+    with pytest.raises(InputError) as e:
+        read_usd(tmp_path / "a.usda")
+    assert word in str(e.value) and "a.usda" in str(e.value) and "\n" not in str(e.value)
+
+
+def test_files_from_before_gs4d_time_are_read(tmp_path):
+    asset = make()
+    write_usd(tmp_path / "a.usdc", asset)
+    stage, prim = splats(tmp_path / "a.usdc")
+    prim.RemoveProperty("gs4d:time")
+    stage.Save()
+    assert read_usd(tmp_path / "a.usdc").clip == asset.clip
+
+
+def test_a_mirrored_asset_is_read_as_it_is_seen(tmp_path):
+    asset = make()
+    write_usd(tmp_path / "a.usdc", asset)
+    stage, _ = splats(tmp_path / "a.usdc")
+    UsdGeom.Xformable(stage.GetDefaultPrim()).AddScaleOp().Set((-1, 2, 1))
+    stage.Save()
+    back = read_usd(tmp_path / "a.usdc")
+    np.testing.assert_allclose(
+        back.xyz * back.clip.scale + back.clip.translation, (asset.xyz * 2 + [1, 2, 3]) * [-1, 2, 1], atol=1e-5
+    )
+    before = rotation_matrices(asset.rotation) * asset.soft_scale()[:, None] * [[[-2], [4], [2]]]
+    after = rotation_matrices(back.rotation) * back.soft_scale()[:, None] * back.clip.scale
+    np.testing.assert_allclose(after @ after.transpose(0, 2, 1), before @ before.transpose(0, 2, 1), atol=1e-6)
 
 
 # ---------------------------------------------------------------- in Blender's own process

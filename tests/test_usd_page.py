@@ -364,11 +364,15 @@ def child(code, *args, cwd=None) -> dict:
     return json.loads(line.removeprefix("RESULT"))
 
 
+def without_fallback(text: str) -> str:
+    return re.sub(r"    fallbackPrimTypes = \{.*?\n    \}\n", "", text, flags=re.S)
+
+
 def test_an_older_reader_sees_points(page, fox):
     """pxr before 26.03 does not know the prim: fallbackPrimTypes counts, and only in the root layer."""
     pytest.importorskip("bpy")
     for name in list(SHOTS):
-        text = re.sub(r"    fallbackPrimTypes = \{.*?\n    \}\n", "", SHOTS[name], flags=re.S)
+        text = without_fallback(SHOTS[name])
         (page / f"without_{name}").write_text(text)
         (page / f"points_{name}").write_text(text.replace("fox.usdc", "fox_points.usdc"))
     names = [*FILES, *PLACES]
@@ -385,6 +389,34 @@ def test_an_older_reader_sees_points(page, fox):
                 assert point is None, (name, path)
             else:
                 np.testing.assert_allclose(point, position[opacity.argmax()], atol=1e-6)
+
+
+READ = (
+    OLD.split("import numpy")[0]
+    + """
+from timesplat.datagen.sequence import InputError
+from timesplat.model.usd import check_usd, read_usd
+out = {}
+for name in sys.argv[1:]:
+    try:
+        asset = read_usd(name)
+        out[name] = [len(asset), asset.clip.frame_start, asset.clip.frame_end, check_usd(name)]
+    except InputError as e:
+        out[name] = str(e)
+print("RESULT" + json.dumps(out))
+"""
+)
+
+
+def test_the_older_library_reads_assets_too(page):
+    pytest.importorskip("bpy")
+    (page / "unknown.usda").write_text(
+        re.sub(r"    fallbackPrimTypes = \{.*?\n    \}\n", "", SHOTS["shot.usda"], flags=re.S)
+    )
+    out = child(READ, "fox.usdz", "shot.usda", "centimetres.usda", "compare.usda", "unknown.usda", cwd=page)
+    assert out["fox.usdz"] == out["compare.usda"] == out["centimetres.usda"] == [50, 0, 23, []]
+    assert out["shot.usda"] == [50, 1001, 1047, []]
+    assert "does not know the type of /shot/fox/splats; add fallbackPrimTypes" in out["unknown.usda"]
 
 
 IMPORT = """
