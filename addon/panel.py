@@ -87,9 +87,7 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
         row = layout.row()
         row.scale_y = 1.5
-        operator = row.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
-        for key in settings.KEYS:
-            setattr(operator, key, getattr(chosen, key))
+        _reconstruct(row, chosen)
         jobs.draw(layout)
         layout.operator("timesplat.import_asset", icon="IMPORT")
 
@@ -150,6 +148,34 @@ class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
             layout.prop(mine, "device")
 
 
+class TIMESPLAT_MT_object(bpy.types.Menu):
+    """In the Object menu, which is also how the menu search (F3) finds what is in it"""
+
+    bl_label = "Timesplat Capture"
+
+    def draw(self, context):
+        layout = self.layout
+        _reconstruct(layout, context.scene.timesplat)
+        layout.operator("timesplat.cancel")
+        layout.operator("timesplat.bring")
+        layout.operator("timesplat.log")
+        layout.separator()
+        layout.operator_enum("timesplat.add_cameras", "rig")
+        layout.separator()
+        layout.operator("timesplat.self_test")
+
+
+def _reconstruct(layout, chosen) -> None:
+    """The button, with the scene's settings."""
+    operator = layout.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
+    for key in settings.KEYS:
+        setattr(operator, key, getattr(chosen, key))
+
+
+def _menu(self, context):
+    self.layout.menu("TIMESPLAT_MT_object")
+
+
 def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
@@ -167,14 +193,17 @@ CLASSES = (
     TIMESPLAT_PT_capture,
     TIMESPLAT_PT_cameras,
     TIMESPLAT_PT_model,
+    TIMESPLAT_MT_object,
 )
 
 
 def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
+    bpy.types.VIEW3D_MT_object.append(_menu)
 
 
 def unregister() -> None:
+    bpy.types.VIEW3D_MT_object.remove(_menu)
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
