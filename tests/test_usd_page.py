@@ -118,6 +118,37 @@ def page(tmp_path_factory, fox) -> Path:
     return folder
 
 
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [
+        ("fox.ply", "name one file to write, or a folder"),
+        ("fox.ply a.usdc --sequence b", "name one file to write, or a folder"),
+        ("fox.ply a.ply --half", "a.ply: --mode, --half, --original and --check are for USD"),
+        ("fox.ply a.usdc --frame 3", "--frame is for one .ply or .splat"),
+        ("fox.ply a.obj", "a.obj: cannot write that"),
+        ("fox.ply a.usdz --original none.usd", "none.usd: no such file"),
+        ("scene.usda a.ply", "scene.usda: no prim is a ParticleField3DGaussianSplat"),
+    ],
+)
+def test_exports_that_cannot_be_say_why(page, capsys, monkeypatch, command, word):
+    monkeypatch.chdir(page)
+    assert main(["export", *command.split()]) == 2
+    told = capsys.readouterr().err
+    assert word in told and len(told.splitlines()) == 1
+    assert not [f for f in page.iterdir() if f.stem == "a"]
+
+
+def test_check_decides_the_exit_code(page, tmp_path, monkeypatch, capsys):
+    """An original that is looked for where it is not: said, and with --check the command fails."""
+    scene = make_original(tmp_path)
+    layer = Sdf.Layer.FindOrOpen(str(scene))
+    layer.GetAttributeAtPath("/world/red/image.inputs:file").default = Sdf.AssetPath("./no.png")
+    layer.Save()
+    command = ["export", str(page / "fox.ply"), str(tmp_path / "a.usdc"), "--original", str(scene)]
+    assert (main(command), main([*command, "--check"])) == (0, 1)
+    assert "no.png" in capsys.readouterr().out
+
+
 def test_the_commands_wrote_what_the_page_says(page, fox):
     back = read_ply(page / "back.ply")
     assert back.clip == replace(fox.clip)

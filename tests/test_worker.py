@@ -198,6 +198,10 @@ def test_usd_and_back_without_torch(tmp_path):
             assert {"event", "out", "complaints", "bytes", "seconds"} == set(said[-1])
             assert said[-1]["complaints"] == [] and said[-1]["bytes"] == (tmp_path / "a.usdz").stat().st_size
     assert said[-1]["gaussians"] == n and said[-1]["asset"] == back
+    code, said, _ = ask(stdin=json.dumps({**write, "original": str(tmp_path / "none.usd")}) + "\n")
+    assert code == 1 and "none.usd: no such file" in said[-1]["message"]
+    code, said, _ = ask(stdin=json.dumps({**write, "original": usd, "out": str(tmp_path / "c.usdz")}) + "\n")
+    assert code == 0 and said[-1]["complaints"] == []
     a, b = read_ply(ply), read_ply(back)
     assert a.clip == b.clip
     for name in ARRAYS:
