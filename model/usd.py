@@ -34,7 +34,7 @@ import numpy as np
 from ..datagen.sequence import InputError
 from .asset import SH_C0, VISIBLE, Asset, atomic, check, linear_from_srgb, rotation_matrices
 from .usd_check import check_usd
-from .usd_read import ORIGINAL, RECONSTRUCTION, SH, SPLAT, VARIANTS, open_stage, pxr, quiet, read_usd
+from .usd_read import ORIGINAL, RECONSTRUCTION, SH, SPLAT, VARIANTS, open_stage, pxr, quiet, read_usd, reading
 
 __all__ = ["MODES", "SUFFIXES", "check_usd", "read_usd", "write_usd"]
 
@@ -85,7 +85,8 @@ def write_usd(
         inner = Path(folder) / "splats.usdc" if package else tmp
         if original is not None:
             shift = 0 if original_start is None else asset.clip.frame_start - original_start
-            _add_original(stage.GetRootLayer(), Path(original), shift, path, Path(folder))
+            with reading(Path(original)):
+                _add_original(stage.GetRootLayer(), Path(original), shift, path, Path(folder))
         try:
             ok = stage.GetRootLayer().Export(str(inner))
             if package:

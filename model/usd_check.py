@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .asset import VISIBLE
-from .usd_read import ORIGINAL, RECONSTRUCTION, SH, SPLAT, open_stage, prims, quiet, select
+from .usd_read import ORIGINAL, RECONSTRUCTION, SH, SPLAT, open_stage, prims, reading, select
 
 
 def check_usd(path: str | Path) -> list[str]:
@@ -16,8 +16,9 @@ def check_usd(path: str | Path) -> list[str]:
     for every splat prim at every time sample array lengths, the SH count, NaN, ranges, unit quaternions, the extent
     and that readers of points see the same; then what UsdValidation has to say, where this pxr has it, also with
     the variant `original` selected. Raises InputError if the file cannot be opened."""
-    with quiet():  # UsdValidation says it again
-        return _check(Path(path))
+    path = Path(path)
+    with reading(path):
+        return _check(path)
 
 
 def _check(path: Path) -> list[str]:

@@ -41,15 +41,23 @@ def quiet() -> Iterator[None]:
         del delegate
 
 
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """`quiet`, and an InputError for what USD and numpy raise over damaged files."""
+    with quiet():
+        try:
+            yield
+        except InputError:
+            raise
+        except (RuntimeError, ValueError, TypeError, IndexError, OverflowError, MemoryError):
+            raise InputError(f"{path}: it is damaged or not a USD file; export it again.") from None
+
+
 def open_stage(path: Path):
-    """The Usd.Stage of a file. Raises InputError: no such file, not USD, damaged."""
-    Usd = pxr()[2]
+    """The Usd.Stage of a file, inside of `reading`. Raises InputError: no such file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name.")
-    try:
-        return Usd.Stage.Open(str(path))
-    except RuntimeError:
-        raise InputError(f"{path}: it is damaged or not a USD file; export it again.") from None
+    return pxr()[2].Stage.Open(str(path))
 
 
 def select(stage, variant: str) -> bool:
@@ -77,7 +85,7 @@ def read_usd(path: str | Path) -> Asset:
     Raises InputError: no such file, not USD, no splats or several of them, a transform that is animated or
     flat, arrays that do not belong together."""
     path = Path(path)
-    with quiet():
+    with reading(path):
         return _read(path)
 
 
@@ -113,15 +121,11 @@ def _read_4d(path: Path, stage, prim) -> Asset:
 
     rgb = prim.HasAttribute("primvars:gs4d:rgb")
     rgb = get("primvars:gs4d:rgb") if rgb else 0.5 + SH_C0 * get(SH, f"{SH}h").astype(np.float64)
-    try:
-        rotation = get("orientations", "orientationsh", "primvars:gs4d:rotation")[:, [3, 0, 1, 2]]
-        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-        pixel = float(prim.GetCustomDataByKey("timesplat:pixel") or 0)
-        start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-        if prim.HasAttribute("gs4d:time"):
-            start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # once, where the clip is one frame
-    except (TypeError, ValueError, IndexError, RuntimeError):
-        raise InputError(f"{path}: orientations or gs4d:time are damaged; export it again.") from None
+    rotation = get("orientations", "orientationsh", "primvars:gs4d:rotation")[:, [3, 0, 1, 2]]
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    if prim.HasAttribute("gs4d:time"):
+        start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # one sample, where the clip is one frame
     t, velocity, sigma_t = (get(f"primvars:gs4d:{name}") for name in ("mu_t", "velocity", "sigma_t"))
     first, last = int(np.floor(start + 1e-6)), int(np.ceil(end - 1e-6))
     if last > first and (first, last) != (start, end):  # retimed to fractional frames
@@ -137,7 +141,7 @@ def _read_4d(path: Path, stage, prim) -> Asset:
         rotation=rotation,
         rgb=rgb.astype(np.float32),
         opacity=get("primvars:gs4d:opacity"),
-        clip=Clip(stage.GetTimeCodesPerSecond(), first, last, pixel=pixel),
+        clip=Clip(stage.GetTimeCodesPerSecond(), first, last, pixel=prim.GetCustomDataByKey("timesplat:pixel") or 0.0),
     )
 
 

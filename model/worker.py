@@ -32,6 +32,7 @@ Whatever a library prints goes to standard error, so that the answers stay whole
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -134,7 +135,17 @@ def _reconstruct(request: dict, progress) -> dict:
     return {"asset": request["asset"], "gaussians": len(gaussians)}
 
 
+def _limit_memory() -> None:
+    """To half of the machine's, where that can be: a damaged USD file may claim to need any amount."""
+    with contextlib.suppress(ImportError, AttributeError, OSError, ValueError):
+        import resource
+
+        half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+        resource.setrlimit(resource.RLIMIT_AS, (half, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
 def _export(request: dict, progress) -> dict:
+    _limit_memory()
     from .asset import read_ply
     from .usd import check_usd, write_usd
 
@@ -154,6 +165,7 @@ def _export(request: dict, progress) -> dict:
 
 
 def _import(request: dict, progress) -> dict:
+    _limit_memory()
     from .asset import write_ply
     from .usd import read_usd
 
