@@ -20,10 +20,7 @@ BUILDS = [
     ("cpu", "CPU", "Runs everywhere: about 300 MB to fetch, 1.3 GB on disk"),
     ("cuda", "CUDA", "For NVIDIA GPUs: several GB to fetch, more on disk"),
 ]
-OFFLINE = (
-    "Online access is off: to install the runtime switch it on under Preferences > System > Network > Allow Online "
-    "Access, or name above a Python that has timesplat[torch]."
-)
+OFFLINE = "Online access is off; Preferences > System > Network > Allow Online Access switches it on."
 SHOWN = ("numba", "numpy", "usd-core", "OpenEXR")
 TEXT = "Timesplat self-test"
 _job: jobs.Job | None = None  # the one that was started here last
@@ -129,12 +126,12 @@ def _tested(event: dict, folder: Path) -> str:
     text = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
     text.from_string("\n".join(_report) + "\n")
     failed = sum(not line.startswith("ok") for line in _report)
+    windows = bpy.context.window_manager.windows
     if bpy.app.background:
         print(text.as_string())
-    else:
-        bpy.context.window_manager.popup_menu(
-            lambda menu, context: _lines(menu.layout), title=TEXT, icon="ERROR" if failed else "CHECKMARK"
-        )
+    elif not any(area.type == "PREFERENCES" for window in windows for area in window.screen.areas):
+        icon = "ERROR" if failed else "CHECKMARK"
+        bpy.context.window_manager.popup_menu(lambda menu, context: _lines(menu.layout), title=TEXT, icon=icon)
     if failed:
         raise InputError(f"Self-test: {failed} of {len(_report)} failed; the text {TEXT!r} says what to do.")
     return f"Self-test: all {len(_report)} passed."
@@ -159,9 +156,8 @@ def draw(layout) -> None:
         box.label(text=", ".join(f"{k} {v}" for k, v in versions.items() if k in SHOWN), icon="BLANK1")
     else:
         box.label(text="Runtime: not installed", icon="IMPORT")
-    if not bpy.app.online_access:
-        for i, line in enumerate(textwrap.wrap(OFFLINE, 70)):
-            box.label(text=line, icon="BLANK1" if i else "INTERNET_OFFLINE")
+        if not bpy.app.online_access:
+            _wrapped(box, OFFLINE, "INTERNET_OFFLINE")
     row = box.row(align=True)
     row.operator_context = "INVOKE_DEFAULT"
     if jobs.running():
@@ -180,18 +176,25 @@ def _progress(box) -> None:
         row.progress(factor=_job.fraction, text=f"{_job.label}: {_job.text}")
         row.operator("timesplat.cancel", text="", icon="X").number = _job.number
     else:
-        column = row.column()
-        for i, line in enumerate(textwrap.wrap(_job.message or _job.text, 70)):
-            column.label(text=line, icon="BLANK1" if i else jobs.ICONS[_job.state])
+        _wrapped(row, _job.message or _job.text, jobs.ICONS[_job.state])
         if _job.state == "waiting":
             row.operator("timesplat.bring", text="", icon="IMPORT").number = _job.number
     row.operator("timesplat.log", text="", icon="TEXT").number = _job.number
 
 
 def _lines(layout) -> None:
+    column = layout.column(align=True)
     for line in _report:
-        for i, part in enumerate(textwrap.wrap(line, 80)):
-            layout.label(text=part, icon="BLANK1" if i else "CHECKMARK" if line.startswith("ok") else "ERROR")
+        _wrapped(column, line.removeprefix("ok "), "CHECKMARK" if line.startswith("ok") else "ERROR")
+
+
+def _wrapped(layout, text: str, icon: str) -> None:
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    region = bpy.context.region  # none in background
+    width = (region.width / bpy.context.preferences.system.ui_scale - 120) / 6.5 if region else 90  # in characters
+    for i, line in enumerate(textwrap.wrap(text, max(int(width), 40))):
+        column.label(text=line, icon="BLANK1" if i else icon)
 
 
 CLASSES = (TIMESPLAT_OT_install_runtime, TIMESPLAT_OT_uninstall_runtime, TIMESPLAT_OT_self_test)

@@ -40,6 +40,7 @@ RADIUS, STEP = 0.5, np.array([0.05, 0.03, 0.02])  # of the sphere, and its way i
 HELD_OUT = Shot(4, "held_out", "target", spherical(35, 25))
 LEAST = 22.0  # dB that a reconstruction of the sphere must reach; see tests/test_selftest.py for what it does reach
 REFINE = 0.5  # seconds
+COMPILES = " (compiled now, if never before)"
 
 
 def selftest(device: str = "cpu", checkpoint: Path | None = None, progress=None) -> list[str]:
@@ -52,7 +53,7 @@ def selftest(device: str = "cpu", checkpoint: Path | None = None, progress=None)
         for i, (check, needs, remedy) in enumerate(CHECKS):
             name = check.__name__.strip("_").replace("_", " ")
             if progress:
-                progress(i / len(CHECKS), name)
+                progress(i / len(CHECKS), name + (COMPILES if check in (_lift, _refinement) else ""))
             if because := [n for n in needs if n in failed]:
                 failed.add(name)
                 report.append(f"FAILED: {name}: not tried; see {because[0]}.")

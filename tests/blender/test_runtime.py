@@ -366,7 +366,7 @@ tell(files=files, drawn=drawn)
 def test_drawing_reads_no_file(installed):
     told = installed(ABLE + DRAW)
     assert told["files"] == []
-    for words in ("'checkpoint'", "torch 2 (CPU), 500 MB", "numpy 2", "Online access is off", "factor=0.5", "No room."):
+    for words in ("'checkpoint'", "torch 2 (CPU), 500 MB", "numpy 2", "factor=0.5", "No room."):
         assert words in told["drawn"], words
     for operator in ("install_runtime", "uninstall_runtime", "self_test", "cancel", "log"):
         assert f"timesplat.{operator}" in told["drawn"]
