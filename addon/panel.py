@@ -12,7 +12,7 @@ from . import jobs, preferences, rigs, settings
 
 PRESETS = {  # what they differ in
     "DRAFT": {"size": 64, "samples": 8, "method": "lift", "budget": "ALL", "refine": 0.0},
-    "BALANCED": {"size": 128, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 5.0},
+    "BALANCED": {"size": 128, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 0.0},
     "FINE": {"size": 256, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 30.0},
 }
 PRESET_ITEMS = [
@@ -83,7 +83,7 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row = col.row(align=True)
             row.label(text=f"{expected.pictures} pictures", icon="RENDER_RESULT")
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
-            about = "at most" if chosen.budget in ("SHARE", "NUMBER") else "about"
+            about = "about" if chosen.budget == "ALL" else "at most"
             col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
         row = layout.row()
         row.scale_y = 1.5

@@ -68,8 +68,9 @@ class Settings:
     method: EnumProperty(name="Method", items=METHODS, default="guided")
     refine: FloatProperty(
         name="Refine",
-        description="Seconds for which the Gaussians are fitted to the pictures",
-        default=5.0,
+        description="Seconds for which the Gaussians are fitted to the pictures. 0: none where all are kept; for fewer "
+        "as long as it takes, 5 s for pictures of 128 pixels and more for larger ones",
+        default=0.0,
         min=0.0,
         max=3600.0,
         subtype="TIME_ABSOLUTE",
@@ -151,7 +152,9 @@ def budget(settings) -> str | None:
 # ---------------------------------------------------------------- how long it takes
 
 FILL = {"guided": 0.19, "lift": 0.19, "rgb": 0.11}  # Gaussians a pixel of the pictures: measured, mean of 12 objects
-START, FITTING = 3.0, 5.0  # seconds: a process's start; a budget without refinement
+START, FITTING = 3.0, 5.0  # seconds: a process's start; a budget's own fit of pictures of PIXELS
+PIXELS = 128**2
+FITTED = 4000  # Gaussians that a fit of pictures of PIXELS uses at most, and in proportion to their sides
 PIXEL = {"guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
 _rate = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
 
@@ -173,9 +176,10 @@ def estimate(settings, context) -> Estimate:
     n *= 1 if settings.in_turn or not placed else len(placed)
     pixels = n * settings.size**2
     predicted = FILL[settings.method] * pixels
-    fit = settings.refine or (FITTING if settings.budget != "ALL" else 0)
-    kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number, "AUTO": 0.05 * predicted}
-    count = min(kept.get(settings.budget, 0.05 * predicted if settings.refine else predicted), predicted)
+    fit = settings.refine or (FITTING * max(settings.size**2 / PIXELS, 1) if settings.budget != "ALL" else 0)
+    most = FITTED * settings.size / PIXELS**0.5 if fit else predicted
+    kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
+    count = min(kept, most, predicted)
     reconstructing = START + pixels * PIXEL[settings.method] + fit * (3 if settings.budget == "AUTO" else 1)
     return Estimate(n, START + pixels * settings.samples * _rate, reconstructing, round(count))
 

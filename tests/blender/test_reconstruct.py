@@ -176,7 +176,13 @@ bpy.ops.object.select_all(action="DESELECT")
 said.append(settings.cameras(bpy.context)[1])
 bpy.data.objects["Camera"].select_set(True)
 said.append(settings.cameras(bpy.context)[1])
-tell(ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
+chosen.in_turn, chosen.every = True, 50
+counts = {}
+for budget, refine, size in (("ALL", 0, 128), ("SHARE", 0, 128), ("SHARE", 0, 32), ("NUMBER", 0, 128), ("ALL", 9, 256)):
+    chosen.budget, chosen.refine, chosen.size, chosen.number = budget, refine, size, 100
+    e = settings.estimate(chosen, bpy.context)
+    counts[f"{budget} {refine} {size}"] = [e.gaussians, e.reconstructing]
+tell(counts=counts, ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
      estimates=estimates)
 """
 
@@ -195,3 +201,10 @@ def test_what_the_settings_select(blender):
     assert told["said"] == [
         "Front, left, back, right in turn", "5 selected cameras", "5 cameras of the rig", "1 selected camera",
     ]  # fmt: skip
+    from timesplat.model.refine import NEAR_FEW
+
+    counts = told["counts"]  # five pictures
+    assert counts["ALL 0 128"][0] == round(0.19 * 5 * 128**2) and counts["SHARE 0 128"][0] == round(0.019 * 5 * 128**2)
+    assert counts["SHARE 0 32"][0] == round(0.019 * 5 * 32**2) and counts["NUMBER 0 128"][0] == 100
+    assert counts["ALL 9 256"][0] == 2 * NEAR_FEW
+    assert counts["SHARE 0 128"][1] - counts["ALL 0 128"][1] == pytest.approx(5)
