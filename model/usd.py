@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import tempfile
 import zipfile
@@ -92,8 +93,9 @@ def write_usd(
             if package:
                 ok = ok and UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(package))
                 shutil.copyfile(package, tmp)
-        except RuntimeError as e:  # Tf.ErrorException is one, and is many lines long
-            raise OSError(str(e).strip().splitlines()[-1]) from None
+        except RuntimeError as e:  # Tf.ErrorException is one, and is many lines long; the first says it
+            said = re.search(r" : '(.+)'$", str(e), re.MULTILINE)
+            raise OSError(said[1] if said else "the USD library stopped") from None
         if not ok:
             raise OSError("the USD library refused")
     if old := Sdf.Layer.Find(str(path)):  # open in this process: it would go on showing the former file

@@ -273,6 +273,34 @@ print("RESULT" + str(refused))
 """
 
 
+FULL = """
+import os, resource, signal, sys
+from pathlib import Path
+from timesplat.datagen.sequence import InputError
+from timesplat.model.asset import read_ply
+from timesplat.model.usd import write_usd
+asset, out = read_ply(sys.argv[1]), Path(sys.argv[2])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    write_usd(out, asset)
+except InputError as e:
+    print("RESULT" + str(e))
+    assert not os.listdir(out.parent), os.listdir(out.parent)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files cannot be limited there")
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
+def test_a_full_disk_leaves_nothing_behind(tmp_path, suffix):
+    from timesplat.model.asset import write_ply
+
+    write_ply(tmp_path / "a.ply", make(5000))
+    (tmp_path / "out").mkdir()
+    told = child(FULL, tmp_path / "a.ply", tmp_path / "out" / f"a{suffix}")
+    assert "File too large" in told and "cannot be written" in told and len(told) < 300, told
+
+
 @pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
 def test_damaged_files_are_refused_or_read(tmp_path, suffix):
     """Nothing but an InputError comes out of 40 damaged copies. (Without a limit to memory the library itself takes
