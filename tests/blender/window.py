@@ -34,6 +34,9 @@ def tab():  # of the 3D viewport's sidebar
         for r in area.regions:
             if area.type == "VIEW_3D" and r.type == "UI" and r.width > 1:
                 return r.active_panel_category
+def clipboard():  # and emptied, so that what is copied next is new
+    said, bpy.context.window_manager.clipboard = bpy.context.window_manager.clipboard, ""
+    return said
 def look():
     return [dict(w=w.width, h=w.height, x=w.x, y=w.y, areas=areas(w)) for w in bpy.context.window_manager.windows]
 def answer():
@@ -208,6 +211,17 @@ class Window:
             self._run("xdotool", "key", k)
             time.sleep(0.25)
 
+    def focus(self) -> None:
+        """Gives the keyboard to the main window: a window manager, of which there is none here, would."""
+        self._run("xdotool", "search", "--name", "Blender [0-9]", "windowfocus")
+        time.sleep(0.5)
+
+    def put_away(self, title: str) -> None:
+        """Takes the window of this title off the screen, as minimising does."""
+        self._run("xdotool", "search", "--name", f"^{title}$", "windowunmap")
+        time.sleep(0.5)
+        self.focus()
+
     def type(self, text: str) -> None:
         self._run("xdotool", "type", "--delay", 25, text)
         time.sleep(0.3)
@@ -215,33 +229,95 @@ class Window:
     # ------------------------------------------------------------ to find what Python cannot point at
 
     def under(self, x: float, y: float, keys: str = "ctrl+c") -> str:
-        """What Blender copies when a person presses ctrl+C over a button: the Python of an operator. With
-        "ctrl+shift+alt+c" the data path of a setting."""
+        """What Blender copies when a person presses ctrl+C over a button: the Python of an operator, the value of
+        a setting; with "ctrl+shift+c" a setting's name."""
         self.move(x, y)
         time.sleep(0.25)
+        self.ask("clipboard()")
         self._run("xdotool", "key", keys)
         time.sleep(0.1)
-        return self.ask("bpy.context.window_manager.clipboard")
+        return self.ask("clipboard()")
 
-    def find(self, wanted: str, x: float, top: float, bottom: float, keys: str = "ctrl+c", step: int = 11) -> float:
-        """The height of the first button of a column under which ctrl+C gives `wanted`."""
+    def find(self, wanted: str, x: float, top: float, bottom: float, keys: str = "ctrl+c", step: int = 10) -> float:
+        """The height of the first button of a column over which `keys` copies something with `wanted` in it."""
         y = top
         while y < bottom:
             if wanted in self.under(x, y, keys):
                 return y + step / 2
             y += step
         self.picture(f"no {wanted}")
-        raise AssertionError(f"nothing at x={x} between {top} and {bottom} is {wanted}")
+        raise AssertionError(f"nothing at x={x} between {top} and {bottom} is {wanted}: {self.pictures}")
 
     # ------------------------------------------------------------ what a person does often
 
-    def menu(self, name: str, operator: str) -> None:
-        """File > Import (or Export) > the entry that runs an operator."""
+    def menu(self, entry: str, operator: str) -> None:
+        """File > Import or Export > the entry that runs an operator."""
         self.click(58, 14)
+        y = {"Import": 311, "Export": 332}[entry]
+        self.click(75, y)
+        self.click(330, self.find(operator, 330, y - 20, HEIGHT - 30))
+
+    def preferences(self, python: str) -> None:
+        """Edit > Preferences > Add-ons > Timesplat: names the Python that has torch, and leaves."""
+        self.move(500, 450)  # the window opens around the mouse
+        time.sleep(0.7)
+        self.key("ctrl+comma")
+        self.wait_for("any(a['kind'] == 'PREFERENCES' for w in look() for a in w['areas'])")
+        time.sleep(1)
+        area = self.area("PREFERENCES")
+        left = next(r for r in area["regions"] if r["kind"] in ("UI", "NAVIGATION_BAR"))
+        for y in range(110, 330, 12):
+            self.click(left["x"] + 80, left["y"] + y)
+            if self.ask("bpy.context.preferences.active_section") == "ADDONS":
+                break
+        page = self.region("PREFERENCES", "WINDOW")
+        self.click(page["x"] + 0.25 * page["w"], page["y"] + 20)
+        self.type("Timesplat")
+        self.key("Return")
+        self.click(page["x"] + 14, page["y"] + 57)  # unfolds it
+        self.picture("preferences")
+        self.click(page["x"] + 0.6 * page["w"], page["y"] + 272)  # its first field
+        self.key("ctrl+a")
+        self.type(python)
+        self.key("Return")
+        self.picture("preferences filled in")
+        self.put_away("Preferences")
+
+    def sidebar(self) -> dict:
+        """Opens the sidebar of the 3D viewport at our tab; returns its region."""
+        area = self.area("VIEW_3D")
+        self.move(area["x"] + area["w"] / 3, area["y"] + area["h"] * 0.8)
+        if self.ask("tab()") is None:
+            time.sleep(0.7)
+            self.key("n")
+            self.wait_for("tab()")
+        region = self.region("VIEW_3D", "UI")
+        for y in range(400, 100, -25):
+            if self.ask("tab()") == "Timesplat":
+                break
+            self.click(region["x"] + region["w"] - 14, y)
+        assert self.ask("tab()") == "Timesplat"
+        return region
+
+    def press(self, operator: str, across: float = 0.5, top: float = 100) -> None:
+        """Clicks the sidebar's button that runs an operator, `across` the sidebar (0 left, 1 right)."""
+        region = self.region("VIEW_3D", "UI")
+        x = region["x"] + across * (region["w"] - 28)
+        self.click(x, self.find(operator, x, max(top, region["y"]), region["y"] + region["h"]))
+
+    def fill(self, setting: str, text: str, across: float = 0.75, top: float = 100) -> None:
+        """Types a value into the sidebar's field of a setting."""
+        region = self.region("VIEW_3D", "UI")
+        x = region["x"] + across * (region["w"] - 28)
+        self.find(setting, x, max(top, region["y"]), region["y"] + region["h"], "ctrl+shift+c")
+        self.key("Return", "ctrl+a")
+        self.type(text)
+        self.key("Return")
 
     def choose(self, path: Path) -> None:
         """Fills in the file browser that stands open, folder and name, and presses its button."""
-        self.wait_for("len(look()) > 1")
+        browser = "any(a['kind'] == 'FILE_BROWSER' for w in look() for a in w['areas'])"
+        self.wait_for(browser)
         time.sleep(1)
         top, bottom = self.region("FILE_BROWSER", "UI"), self.region("FILE_BROWSER", "EXECUTE")
         for region, text in ((top, f"{path.parent}/"), (bottom, path.name)):
@@ -251,4 +327,5 @@ class Window:
             self.key("Return")
             time.sleep(0.5)
         self.click(bottom["x"] + 0.9 * bottom["w"], bottom["y"] + bottom["h"] / 2)
-        self.wait_for("len(look()) == 1")
+        self.wait_for("not " + browser)
+        self.focus()
