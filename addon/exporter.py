@@ -20,31 +20,32 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ..datagen.sequence import InputError
-from ..model import formats, usd
+from ..model import slices, usd
 from ..model.asset import Asset, atomic, write_ply
 from . import display, edit, preferences, process
+from .importer import busy
 
 REPORT = "Timesplat USD report"
 SUFFIX = {"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz", "SLICE": ".ply", "SPLAT": ".splat"}
 SUFFIX |= {"SLICES": ""}
 FORMAT_ITEMS = [
-    ("PLY", "4D .ply", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
-    ("USDC", "USD, Binary (.usdc)", "For pipelines"),
-    ("USDA", "USD, Text (.usda)", "Large; to look into"),
-    ("USDZ", "USD, Package (.usdz)", "One file with all it needs"),
-    ("SLICE", "3DGS .ply, This Frame", "For 3DGS viewers and tools: what is visible at the current frame"),
-    ("SPLAT", ".splat, This Frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
-    ("SLICES", "3DGS .ply, All Frames", "A new folder with a .ply for every frame of the clip"),
+    ("PLY", "4D PLY", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
+    ("USDC", "USDC (binary)", "USD for pipelines"),
+    ("USDA", "USDA (text)", "USD to look into: large"),
+    ("USDZ", "USDZ (package)", "USD in one file with all it needs"),
+    ("SLICE", "3DGS PLY, this frame", "For 3DGS viewers and tools: what is visible at the current frame"),
+    ("SPLAT", ".splat, this frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
+    ("SLICES", "3DGS PLY, all frames", "A new folder with a .ply for every frame of the clip"),
 ]
 MODE_ITEMS = [
     ("splats", "Splats", "A Gaussian splat prim, which older readers take as points"),
     ("points", "Points", "A points prim only, for files that are referenced into others and for older readers"),
-    ("frames", "Splats, Every Frame", "Positions at every frame, for readers that do not interpolate"),
+    ("frames", "Splats, every frame", "Positions at every frame, for readers that do not interpolate"),
 ]
 
 
 def present(ob, apply_sliders: bool) -> Asset:
-    """The asset as the object shows it now, with its place in the world in the clip (see `formats.placed`).
+    """The asset as the object shows it now, with its place in the world in the clip (see `slices.placed`).
     Raises InputError."""
     asset = edit.applied(ob) if apply_sliders else edit.asset_of(ob)
     bpy.context.view_layer.update()  # a script may have moved it just now
@@ -53,7 +54,7 @@ def present(ob, apply_sliders: bool) -> Asset:
     own[:3, 3] = clip.translation
     if np.allclose(matrix, own, rtol=1e-6, atol=1e-6 * clip.scale):
         return asset  # it was not moved: the clip's numbers are exacter than the object's
-    return formats.placed(asset, matrix)
+    return slices.placed(asset, matrix)
 
 
 def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, context) -> list[str]:
@@ -131,9 +132,7 @@ def _export_original(ob, path: Path, frames: range, context) -> None:
             o.select_set(True)
         layer.objects.active = active
     if not path.is_file():
-        raise InputError(
-            f"{ob.name}: Blender could not export what it was made from ({why}); do without it."
-        )
+        raise InputError(f"{ob.name}: Blender could not export what it was made from ({why}); do without it.")
 
 
 def with_suffix(filepath: str, kind: str) -> str:
@@ -210,8 +209,8 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
             if not self.filepath:
                 raise InputError("No file was named; choose one.")
             path = Path(bpy.path.abspath(with_suffix(self.filepath, self.format)))
-            asset = present(context.object, self.apply_sliders)
-            level, said = self.write(path, asset, context)
+            with busy(context):
+                level, said = self.write(path, present(context.object, self.apply_sliders), context)
         except (InputError, OSError) as e:  # the latter: no room for temporary files
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
@@ -224,9 +223,9 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         if self.format == "PLY":
             write_ply(path, asset)
         elif self.format in ("SLICE", "SPLAT"):
-            return "INFO", f"{formats.write_slice(path, asset, frame)} Gaussians of frame {frame:g}."
+            return "INFO", f"{slices.write_slice(path, asset, frame)} Gaussians of frame {frame:g}."
         elif self.format == "SLICES":
-            return "INFO", f"{formats.write_slices(path, asset, path.name)} files."
+            return "INFO", f"{slices.write_slices(path, asset, path.name)} files."
         elif self.with_original:
             with original_usd(context.object, path, asset.clip.frames, context) as original:
                 return self.write_usd(path, asset, original, context)

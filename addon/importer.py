@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
@@ -54,6 +55,18 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> fo
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy)}
         process.ask(preferences.worker_python(context), request)
         return formats.Loaded(read_ply(copy), "Z")
+
+
+@contextmanager
+def busy(context):
+    """The mouse pointer says so for as long."""
+    if window := context.window:  # none in background
+        window.cursor_modal_set("WAIT")
+    try:
+        yield
+    finally:
+        if window:
+            window.cursor_modal_restore()
 
 
 class TIMESPLAT_OT_import_asset(bpy.types.Operator):
@@ -129,7 +142,8 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
     def execute(self, context):
         try:
             paths = self.paths()
-            loaded = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
+            with busy(context):
+                loaded = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
         except (InputError, OSError) as e:  # the latter: no room for temporary files
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}

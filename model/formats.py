@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Other programs' Gaussian splats, in and out: numpy and the standard library only, for inside Blender.
+"""Reads other programs' Gaussian splats: numpy and the standard library only, for inside Blender.
 
-In: 3DGS .ply (by `asset.read_ply`), SuperSplat's compressed .ply, .splat (antimatter15), .spz (Niantic,
-versions 1 to 4), and any of these a frame as a sequence. Out: one moment of a 4D asset as a plain 3DGS .ply
-or .splat, and a folder of them. Colour that depends on the direction (spherical harmonics beyond degree 0)
-is left out. Nothing of a file is believed before it is checked; what is wrong with it is one InputError.
+3DGS .ply (by `asset.read_ply`), SuperSplat's compressed .ply, .splat (antimatter15), .spz (Niantic, versions 1
+to 4), and any of these a frame as a sequence. Colour that depends on the direction (spherical harmonics beyond
+degree 0) is left out. Nothing of a file is believed before it is checked; what is wrong with it is one
+InputError. The other way, one moment of a 4D asset for other programs: slices.py.
 
 Sources: github.com/nianticlabs/spz (README.md, load-spz.cc), github.com/antimatter15/splat (convert.py),
 github.com/playcanvas/splat-transform (compressed-chunk.ts).
@@ -15,29 +15,23 @@ from __future__ import annotations
 import gzip
 import io
 import re
-import shutil
 import struct
-import tempfile
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from ..datagen.sequence import InputError
 from .asset import (
-    GAUSSIAN_3D,
-    OPACITY_EPS,
     SH_C0,
     STATIC_SIGMA_T,
-    VISIBLE,
     Asset,
     Clip,
-    atomic,
     check,
     read_ply,
-    rotation_matrices,
 )
 
 SUFFIXES = (".ply", ".splat", ".spz")
@@ -154,7 +148,7 @@ def _wrong_kind(path: Path, head: bytes, otherwise: str) -> InputError:
     return InputError(f"{path}: it is {what}, not a Gaussian splat {path.suffix}; choose another file.")
 
 
-def _static(path: Path, xyz, scale, rotation, rgb, opacity) -> Asset:
+def static(source: str | Path, xyz, scale, rotation, rgb, opacity) -> Asset:
     """An asset that does not change from arrays of any float dtype; quaternions are normalised."""
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     rotation = np.where(length > 0, rotation / np.maximum(length, 1e-30), [1.0, 0, 0, 0])
@@ -162,7 +156,7 @@ def _static(path: Path, xyz, scale, rotation, rgb, opacity) -> Asset:
     arrays = {"xyz": xyz, "t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
     arrays |= {"scale": scale, "rotation": rotation, "rgb": rgb, "opacity": opacity}
     asset = Asset(**{k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()})
-    check(asset, path)
+    check(asset, source)
     return asset
 
 
@@ -239,7 +233,7 @@ def _read_compressed(path: Path) -> Asset:
         rgb = between(("r", "g", "b"), colour[:, :3]) if "min_r" in chunk.dtype.names else colour[:, :3]
         turn = bits("packed_rotation", 2, 10, 10, 10)
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
-            return _static(
+            return static(
                 path,
                 xyz=between(("x", "y", "z"), bits("packed_position", 11, 10, 11)),
                 scale=np.exp(between(("scale_x", "scale_y", "scale_z"), bits("packed_scale", 11, 10, 11))),
@@ -255,7 +249,7 @@ def _read_compressed(path: Path) -> Asset:
 
 # ---------------------------------------------------------------- .splat
 
-_SPLAT = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+SPLAT = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
 
 def _read_splat(path: Path) -> Loaded:
@@ -263,9 +257,9 @@ def _read_splat(path: Path) -> Loaded:
     data = path.read_bytes()
     if not data:
         raise InputError(f"{path}: it is empty; choose a Gaussian splat .splat.")
-    if len(data) % _SPLAT.itemsize:
+    if len(data) % SPLAT.itemsize:
         raise _wrong_kind(path, data, f"it is truncated or not a .splat ({len(data)} bytes are not a multiple of 32)")
-    rows = np.frombuffer(data, _SPLAT)
+    rows = np.frombuffer(data, SPLAT)
     xyz, scale = rows["xyz"], rows["scale"]
     rotation = rows["rotation"].astype(np.float32) / 128 - 1
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 0.1
@@ -275,7 +269,7 @@ def _read_splat(path: Path) -> Loaded:
         wrong = (~(sane & unit)).sum()
         raise _wrong_kind(path, data, f"it is damaged or not a .splat ({wrong} of {len(rows)} Gaussians make no sense)")
     rgba = rows["rgba"].astype(np.float32) / 255
-    asset = _static(path, xyz, np.maximum(scale, 1e-9), rotation, rgba[:, :3], rgba[:, 3])
+    asset = static(path, xyz, np.maximum(scale, 1e-9), rotation, rgba[:, :3], rgba[:, 3])
     return Loaded(asset, "-Y")
 
 
@@ -319,7 +313,7 @@ def _zstd_sections(path: Path, f) -> tuple[bytes, Callable[[int, int], bytes]]:
     streams, toc = struct.unpack_from("<BI", head, 15)
     f.seek(toc)
     table = struct.unpack(f"<{2 * streams}Q", f.read(16 * streams))
-    starts = np.cumsum([toc + 16 * streams, *table[:-2:2]], dtype=object)
+    starts = list(accumulate([toc + 16 * streams, *table[::2]]))
 
     def section(size: int, number: int) -> bytes:
         if number >= streams or table[2 * number + 1] != size:
@@ -363,7 +357,7 @@ def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> Loade
     else:
         three = turn.astype(np.float32) / 127.5 - 1
         rotation = np.concatenate([three, np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True)))], 1)
-    asset = _static(
+    asset = static(
         path,
         xyz=xyz,
         scale=np.exp(scale.astype(np.float32) / 16 - 10),
@@ -372,130 +366,3 @@ def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> Loade
         opacity=alpha[:, 0].astype(np.float32) / 255,
     )
     return Loaded(asset, "Y", _note(degree > 0))
-
-
-# ---------------------------------------------------------------- placing
-
-
-def placed(asset: Asset, matrix: np.ndarray) -> Asset:
-    """The asset whose clip places it where `matrix` (4,4), from normalised space to the world, would: the
-    clip's own scale and translation are replaced. Exact for every matrix that can be inverted: a uniform scale
-    and the translation go into the clip, a rotation turns the Gaussians, and anything else (shear, unequal
-    scales, a mirror) makes other Gaussians of them, `softened` before. Raises InputError for a flat one."""
-    matrix = np.asarray(matrix, np.float64)
-    size = np.cbrt(abs(np.linalg.det(matrix[:3, :3]))) if np.isfinite(matrix).all() else 0
-    if size < 1e-9:
-        raise InputError("The object is scaled to nothing; give it a scale.")
-    A = matrix[:3, :3] / size
-    clip = replace(asset.clip, scale=float(size), translation=tuple(map(float, matrix[:3, 3])))
-    if np.abs(A - np.eye(3)).max() < 1e-6:
-        return replace(asset, clip=clip)
-    if np.abs(A @ A.T - np.eye(3)).max() < 1e-5 and np.linalg.det(A) > 0:
-        asset = replace(asset, clip=clip, rotation=_turned(A, asset.rotation))
-    else:
-        asset = replace(asset, clip=clip).softened()
-        axes, scale, _ = np.linalg.svd(A @ (rotation_matrices(asset.rotation) * asset.scale[:, None, :]))
-        axes[np.linalg.det(axes) < 0, :, 2] *= -1  # a Gaussian has no handedness
-        asset = replace(asset, scale=scale.astype(np.float32), rotation=_quaternions(axes))
-    moved = {k: (getattr(asset, k) @ A.T).astype(np.float32) for k in ("xyz", "velocity")}
-    return replace(asset, **moved)
-
-
-def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    """(N,3,3) rotation matrices -> (N,4) unit quaternions w x y z, float32."""
-    m = matrices
-    x, y, z = (m[:, i, i] for i in range(3))
-    squares = np.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], 1)  # 4 q_i²
-    a, b, c = (m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1])
-    d, e, f = (m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2])
-    s0, s1, s2, s3 = squares.T
-    products = np.stack([s0, a, b, c, a, s1, d, e, b, d, s2, f, c, e, f, s3], 1).reshape(-1, 4, 4)  # 4 q_i q_j
-    q = products[np.arange(len(m)), squares.argmax(1)]
-    return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
-
-
-def _turned(rotation: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Quaternions q (N,4) after the rotation matrix (3,3)."""
-    w, x, y, z = _quaternions(rotation[None])[0].astype(np.float64)
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return (q @ left.T).astype(np.float32)
-
-
-# ---------------------------------------------------------------- writing
-
-
-def slice_at(asset: Asset, frame: float) -> Asset:
-    """What is visible at a (fractional) frame as an asset that does not change, for tools that know nothing of
-    time: in world units, with Z turned to -Y, which those take for up; scales are `soft_scale`. Beyond the
-    clip's ends it is held, as on the timeline. Where nothing is visible (VISIBLE) the least faint Gaussian
-    stays, because empty files are refused by many."""
-    clip = asset.clip
-    held = min(max(frame, clip.frame_start), clip.frame_end)
-    xyz, opacity = asset.at(clip.frame_to_time(held))
-    seen = opacity >= VISIBLE
-    seen[opacity.argmax()] |= not seen.any()
-    world = xyz[seen] * np.float32(clip.scale) + np.array(clip.translation, np.float32)
-    down = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)  # (x, y, z) -> (x, -z, y)
-    return _static(
-        Path("the slice"),
-        xyz=world @ down.T,
-        scale=asset.soft_scale()[seen] * np.float32(clip.scale),
-        rotation=_turned(down, asset.rotation[seen]),
-        rgb=asset.rgb[seen],
-        opacity=opacity[seen],
-    )
-
-
-def write_slice(path: str | Path, asset: Asset, frame: float) -> int:
-    """Writes `slice_at` as a plain 3DGS .ply or as a .splat, by the suffix; whole or not at all. Returns the
-    number of Gaussians. Raises InputError."""
-    path = Path(path)
-    check(asset, path)
-    if path.suffix.lower() not in (".ply", ".splat"):
-        raise InputError(f"{path}: the name of a slice must end in .ply or .splat; choose one of these.")
-    part = slice_at(asset, frame)
-    with atomic(path) as tmp:
-        tmp.write_bytes(_splat_bytes(part) if path.suffix.lower() == ".splat" else _ply_bytes(part, frame))
-    return len(part)
-
-
-def write_slices(folder: str | Path, asset: Asset, stem: str) -> int:
-    """Writes a 3DGS .ply for every frame of the clip into a new folder, stem_0001.ply and so on by the frame's
-    number; the folder appears whole or not at all. Returns the number of files. Raises InputError, also if the
-    folder exists and is not empty."""
-    folder = Path(folder)
-    check(asset, folder)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"{folder}: it exists already and is not an empty folder; choose another name.")
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as tmp:
-            whole = Path(tmp) / "frames"
-            whole.mkdir()
-            for frame in asset.clip.frames:
-                (whole / f"{stem}_{frame:04d}.ply").write_bytes(_ply_bytes(slice_at(asset, frame), frame))
-            if folder.is_dir():
-                folder.rmdir()
-            shutil.move(whole, folder)
-    except OSError as e:
-        raise InputError(f"{folder}: it cannot be written ({e.strerror or e}); choose another place.") from None
-    return len(asset.clip.frames)
-
-
-def _ply_bytes(part: Asset, frame: float) -> bytes:
-    o = np.clip(part.opacity.astype(np.float64), OPACITY_EPS, 1 - OPACITY_EPS)
-    columns = [part.xyz, (part.rgb - 0.5) / SH_C0, np.log(o / (1 - o))[:, None], np.log(part.scale), part.rotation]
-    header = ["ply", "format binary_little_endian 1.0", f"comment frame {frame:g} of a 4D asset by Timesplat, -Y is up"]
-    header += [f"element vertex {len(part)}", *(f"property float {p}" for p in GAUSSIAN_3D), "end_header", ""]
-    return "\n".join(header).encode("ascii") + np.concatenate(columns, 1).astype("<f4").tobytes()
-
-
-def _splat_bytes(part: Asset) -> bytes:
-    """Large and opaque ones first, because viewers show a .splat while it loads."""
-    order = np.argsort(-part.scale.prod(1, dtype=np.float64) * part.opacity, kind="stable")
-    rows = np.empty(len(part), _SPLAT)
-    rows["xyz"], rows["scale"] = part.xyz[order], part.scale[order]
-    rgba = np.concatenate([part.rgb, part.opacity[:, None]], 1)[order]
-    rows["rgba"] = np.round(rgba.clip(0, 1) * 255)
-    rows["rotation"] = np.round(part.rotation[order] * 128 + 128).clip(0, 255)
-    return rows.tobytes()

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from timesplat.datagen.sequence import InputError
-from timesplat.model import formats
+from timesplat.model import formats, slices
 from timesplat.model.asset import (
     ARRAYS,
     SH_C0,
@@ -196,14 +196,17 @@ def test_splat(tmp_path):
     assert got.up == "-Y"
 
 
+NAMES = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+PLAIN = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+PLAIN += "".join(f"property float {p}\n" for p in NAMES.split()) + "end_header\n"
+PLAIN = PLAIN.encode() + np.ones(18, "<f4").tobytes()
+
+
 def test_ply_tells_whose_it_is_and_what_is_left_out(tmp_path):
     asset = make(9)
     write_ply(tmp_path / "ours.ply", asset)
     assert (formats.read(tmp_path / "ours.ply").up, formats.read(tmp_path / "ours.ply").note) == ("Z", "")
-    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
-    head += "".join(f"property float {p}\n" for p in names.split()) + "end_header\n"
-    (tmp_path / "plain.ply").write_bytes(head.encode() + np.ones(18, "<f4").tobytes())
+    (tmp_path / "plain.ply").write_bytes(PLAIN)
     plain = formats.read(tmp_path / "plain.ply")
     assert plain.up == "-Y" and "spherical harmonics" in plain.note
 
@@ -215,13 +218,13 @@ def test_each_frame_of_a_sequence_shows_its_own_file(tmp_path):
     parts = [make(n, seed=n) for n in (5, 9, 3, 6)]
     names = ["f_2.ply", "f_9.ply", "f_10.ply", "f_100.ply"]
     for part, name in zip(parts, names, strict=True):
-        formats.write_slice(tmp_path / name, part, part.clip.frame_start)
-    slices = [formats.read(tmp_path / n).asset for n in names]
+        slices.write_slice(tmp_path / name, part, part.clip.frame_start)
+    stills = [formats.read(tmp_path / n).asset for n in names]
     assert formats.folder_files(tmp_path) == [tmp_path / n for n in names]
     loaded = formats.read_sequence([tmp_path / n for n in sorted(names)], fps=12, frame_start=7)
     asset = loaded.asset
     assert asset.clip == Clip(12, 7, 10) and loaded.up == "-Y"
-    for frame, one in zip(range(7, 11), slices, strict=True):
+    for frame, one in zip(range(7, 11), stills, strict=True):
         xyz, opacity = asset.at(asset.frame_to_time(frame))
         own = asset.t == np.float32(asset.frame_to_time(frame))
         np.testing.assert_array_equal(xyz[own], one.xyz)
@@ -238,7 +241,7 @@ def test_each_frame_of_a_sequence_shows_its_own_file(tmp_path):
 def test_what_is_no_sequence_is_refused(tmp_path, monkeypatch):
     asset = make(9)
     for name in ("a.ply", "b.ply"):
-        formats.write_slice(tmp_path / name, asset, 5)
+        slices.write_slice(tmp_path / name, asset, 5)
     write_ply(tmp_path / "four.ply", asset)
     (tmp_path / "up.spz").write_bytes(base64.b85decode(SPZ_3))
     for other in ("four.ply", "up.spz"):
@@ -277,7 +280,7 @@ def test_placed_is_the_matrix(A):
     asset = make(50)
     M = np.eye(4)
     M[:3, :3], M[:3, 3] = A, [4, 5, -6]
-    out = formats.placed(asset, M)
+    out = slices.placed(asset, M)
     check(out)
     c = out.clip
     assert c.translation == (4, 5, -6) and np.isclose(c.scale**3, abs(np.linalg.det(A)))
@@ -294,20 +297,20 @@ def test_placed_leaves_alone_what_needs_no_change():
     asset = make(5)
     M = np.diag([2.5, 2.5, 2.5, 1])
     M[:3, 3] = 1, -2, 3
-    same = formats.placed(asset, M)
+    same = slices.placed(asset, M)
     assert same.clip == CLIP and all(getattr(same, k) is getattr(asset, k) for k in ARRAYS)
-    turned = formats.placed(asset, np.block([[rotation_of(3), np.zeros((3, 1))], [np.zeros((1, 3)), 1]]))
+    turned = slices.placed(asset, np.block([[rotation_of(3), np.zeros((3, 1))], [np.zeros((1, 3)), 1]]))
     assert turned.scale is asset.scale and turned.clip.pixel == CLIP.pixel
     for flat in (np.diag([1.0, 1, 0, 1]), np.full((4, 4), np.nan)):
         with pytest.raises(InputError, match="scaled to nothing"):
-            formats.placed(asset, flat)
+            slices.placed(asset, flat)
 
 
 @pytest.mark.parametrize("frame", [3, 7.25, 12, 99, -5])
 def test_a_slice_is_the_asset_at_its_time(tmp_path, frame):
     asset = make(300)
     path = tmp_path / "s.ply"
-    count = formats.write_slice(path, asset, frame)
+    count = slices.write_slice(path, asset, frame)
     xyz, opacity = asset.at(asset.frame_to_time(min(max(frame, 3), 12)))
     seen = opacity >= VISIBLE
     assert count == seen.sum() < 300
@@ -326,8 +329,8 @@ def test_a_slice_is_the_asset_at_its_time(tmp_path, frame):
 
 def test_a_slice_as_splat_is_the_same_to_its_bytes(tmp_path):
     asset = make(100)
-    formats.write_slice(tmp_path / "s.ply", asset, 6)
-    formats.write_slice(tmp_path / "s.splat", asset, 6)
+    slices.write_slice(tmp_path / "s.ply", asset, 6)
+    slices.write_slice(tmp_path / "s.splat", asset, 6)
     a, b = (formats.read(tmp_path / f"s.{x}").asset for x in ("ply", "splat"))
     order = np.argsort(-a.scale.prod(1, dtype=float) * a.opacity)
     for name, tolerance in (("xyz", 0), ("scale", 1e-6), ("rgb", 0.003), ("opacity", 0.003), ("rotation", 0.012)):
@@ -337,22 +340,22 @@ def test_a_slice_as_splat_is_the_same_to_its_bytes(tmp_path):
 def test_a_moment_at_which_nothing_is_visible_has_one_gaussian(tmp_path):
     asset = make(30)
     asset.t[:], asset.sigma_t[:] = 1, 0.01
-    assert formats.write_slice(tmp_path / "s.ply", asset, 3) == 1
+    assert slices.write_slice(tmp_path / "s.ply", asset, 3) == 1
     assert formats.read(tmp_path / "s.ply").asset.opacity[0] < 1e-5
 
 
 def test_slices_come_whole_or_not_at_all(tmp_path, monkeypatch):
     asset = make(30)
-    assert formats.write_slices(tmp_path / "all", asset, "x") == 10
+    assert slices.write_slices(tmp_path / "all", asset, "x") == 10
     assert sorted(os.listdir(tmp_path / "all")) == [f"x_{f:04d}.ply" for f in range(3, 13)]
     for frame in (3, 12):
-        formats.write_slice(tmp_path / "one.ply", asset, frame)
+        slices.write_slice(tmp_path / "one.ply", asset, frame)
         assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "all" / f"x_{frame:04d}.ply").read_bytes()
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match="exists already"):
-        formats.write_slices(tmp_path / "all", asset, "x")
+        slices.write_slices(tmp_path / "all", asset, "x")
     with pytest.raises(InputError, match="exists already"):
-        formats.write_slices(tmp_path / "one.ply", asset, "x")
+        slices.write_slices(tmp_path / "one.ply", asset, "x")
 
     def full(self, data, calls=[]):  # noqa: B006
         calls.append(data)
@@ -361,16 +364,16 @@ def test_slices_come_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", full)
     for write in (
-        lambda: formats.write_slices(tmp_path / "more", asset, "x"),
-        lambda: formats.write_slice(tmp_path / "more.ply", asset, 5),
+        lambda: slices.write_slices(tmp_path / "more", asset, "x"),
+        lambda: slices.write_slice(tmp_path / "more.ply", asset, 5),
     ):
         with pytest.raises(InputError, match=r"more.*: it cannot be written \(No space left on device\)"):
             write()
     assert sorted(tmp_path.rglob("*")) == before
     with pytest.raises(InputError, match=r"must end in \.ply or \.splat"):
-        formats.write_slice(tmp_path / "a.spz", asset, 5)
+        slices.write_slice(tmp_path / "a.spz", asset, 5)
     with pytest.raises(InputError, match="NaN"):
-        formats.write_slice(tmp_path / "a.ply", replace(asset, xyz=asset.xyz * np.float32("nan")), 5)
+        slices.write_slice(tmp_path / "a.ply", replace(asset, xyz=asset.xyz * np.float32("nan")), 5)
 
 
 # ---------------------------------------------------------------- what is something else
@@ -454,7 +457,7 @@ WHOLE = {
     "b.spz": base64.b85decode(SPZ_4),
     "c.spz": None,  # damage inside the gzip stream, under a whole check sum
     "a.ply": compressed(),
-    "b.ply": CLOUD.replace(b"float x\n", b"".join(b"float %s\nproperty " % p.encode() for p in "xyz")[:-9]),
+    "b.ply": PLAIN,
 }
 
 

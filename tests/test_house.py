@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("datagen", "model", "addon")
 FILES = sorted([*ROOT.glob("*.py"), *(f for floor in FLOORS for f in (ROOT / floor).rglob("*.py"))])
 NAMES = [f.relative_to(ROOT).as_posix() for f in FILES]
-TORCH_FREE = ("datagen/", "addon/", "model/asset.py", "model/formats.py", "model/usd.py")
+TORCH_FREE = ("datagen/", "addon/", "model/asset.py", "model/formats.py", "model/slices.py", "model/usd.py")
 TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 
 
@@ -56,7 +56,7 @@ def test_floors(name):
         assert others <= {"datagen.sequence", "datagen.rigs"}
     if floor == "addon":
         others = {r for r in told if not r.startswith(("addon", "datagen."))}
-        assert others <= {"model.asset", "model.formats", "model.usd"}
+        assert others <= {"model.asset", "model.formats", "model.slices", "model.usd"}
     elif name != "__init__.py":
         told -= {"addon.package"} if name == "cli.py" else set()  # builds the .zip, without bpy
         assert not any(r.split(".")[0] == "addon" for r in told), "nobody imports the add-on"

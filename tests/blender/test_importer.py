@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from timesplat.model import formats
+from timesplat.model import slices
 from timesplat.model.asset import ARRAYS, VISIBLE, read_ply, write_ply
 
 from .helpers import make
@@ -51,7 +51,7 @@ def test_other_programs_files_stand_upright(blender, tmp_path):
     """A slice has -Y up and lies over the asset again; .spz has Y up."""
     asset = make(60)
     for suffix in ("ply", "splat"):
-        formats.write_slice(tmp_path / f"a.{suffix}", asset, 12)
+        slices.write_slice(tmp_path / f"a.{suffix}", asset, 12)
     head = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 4, 0, 0)
     point = b"".join((16 * v).to_bytes(3, "little", signed=True) for v in (1, 2, 3))
     (tmp_path / "a.spz").write_bytes(gzip.compress(head + point + bytes([255, 1, 2, 3, 90, 90, 90, 0, 0, 0, 192])))
@@ -74,7 +74,7 @@ def test_several_files_or_a_folder_are_a_sequence(blender, tmp_path):
     folder.mkdir()
     names = ["f8.ply", "f9.ply", "f10.ply"]
     for part, name in zip(parts, names, strict=True):
-        formats.write_slice(folder / name, part, 12)
+        slices.write_slice(folder / name, part, 12)
     code = (
         IMPORT
         + """
