@@ -22,6 +22,7 @@ import os
 import queue
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -302,6 +303,8 @@ def _leave_when_stdin_closes() -> None:
     with contextlib.suppress(ValueError):
         while sys.stdin.readline():
             pass
+    if os.name == "posix" and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)  # pip and all that it has started, and this process
     if _child and _child.poll() is None:
         _child.kill()
     os._exit(3)

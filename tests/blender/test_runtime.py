@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 import tomllib
 import zipfile
 from pathlib import Path
@@ -200,6 +201,36 @@ def test_a_python_without_ensurepip(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "ensurepip" else real(n))
     pip = runtime._make_venv(tmp_path / "v")  # a pip from outside serves as well
     assert pip[-2] == "--python" and runtime._python_in(tmp_path / "v").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self/cwd").exists(), reason="looks at processes in /proc")
+def test_it_goes_with_blender(tmp_path, index):
+    """Standard input ends when Blender is gone; then pip and what it started go too."""
+    wheel(index, "torch", "9.9", "import time; time.sleep(60)")
+    work = tmp_path / "work"
+    work.mkdir()
+    request = {"task": "install", "folder": str(tmp_path / "venv"), "work": str(work), "build": "cpu", "watch": True}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-I", str(SCRIPT)], stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, cwd=work,
+        env={**os.environ, **pip(index)}, start_new_session=True,
+    ) as process:  # fmt: skip
+        process.stdin.write(json.dumps(request) + "\n")
+        process.stdin.flush()
+        assert any("importing" in line for line in process.stdout)
+        process.stdin.close()
+        assert process.wait(10) != 0
+
+    def here(pid: str) -> bool:
+        try:
+            return os.readlink(f"/proc/{pid}/cwd").startswith(str(work))
+        except OSError:
+            return False
+
+    end = time.monotonic() + 10
+    while (left := [pid for pid in os.listdir("/proc") if pid.isdigit() and here(pid)]) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert left == [] and not (tmp_path / "venv").exists()
 
 
 def test_it_needs_what_the_package_says():
