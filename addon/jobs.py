@@ -61,24 +61,32 @@ class Job:
         if self.state != "running":
             return False
         events = self.child.poll(timeout)
-        for event in events:
-            share = self._shares[0]
-            if event["event"] == "progress":
-                self.fraction, self.text = self._before + share * event["fraction"], event["text"]
-            elif event["event"] == "error":
-                self._end("failed", event["message"])
-            else:
-                self._before += self._shares.pop(0)
-                self.fraction = self._before
-                self.child.kill()  # it has said all; what it leaves running goes too
-                if self._stages:
-                    try:
-                        self._next()
-                    except InputError as e:
-                        self._end("failed", str(e))
-                else:
-                    self._event, self.state, self.text = event, "waiting", "done"
+        try:
+            for event in events:
+                self._take(event)
+        except InputError as e:
+            self._end("failed", str(e))
+        except Exception as e:  # a timer that raises is never called again
+            self._fail("The next step cannot be started", e)
         return bool(events)
+
+    def _take(self, event: dict) -> None:
+        if event["event"] == "progress":
+            self.fraction, self.text = self._before + self._shares[0] * event["fraction"], event["text"]
+        elif event["event"] == "error":
+            self._end("failed", event["message"])
+        else:
+            self._before += self._shares.pop(0)
+            self.fraction = self._before
+            self.child.kill()  # it has said all; what it leaves running goes too
+            if self._stages:
+                self._next()
+            else:
+                self._event, self.state, self.text = event, "waiting", "done"
+
+    def _fail(self, what: str, error: Exception) -> None:
+        self._log += traceback.format_exc()
+        self._end("failed", f"{what}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
 
     def bring(self) -> None:
         """Hands the result over, in Object Mode; the Job is done then, or has failed."""
@@ -87,10 +95,7 @@ class Job:
         except InputError as e:
             self._end("failed", str(e))
         except Exception as e:
-            self._log += traceback.format_exc()
-            self._end(
-                "failed", f"The result cannot be brought in: {type(e).__name__}: {' '.join(str(e).split())[:300]}"
-            )
+            self._fail("The result cannot be brought in", e)
         else:
             self._end("done", message)
 
@@ -181,8 +186,9 @@ def _quiet(job: Job) -> bool:
 
 def _redraw(job: Job) -> None:
     text = f"Timesplat: {job.text}, {job.fraction:.0%} (Esc over a 3D view cancels)"
+    for workspace in bpy.data.workspaces:
+        workspace.status_text_set(text if running() else None)
     for window in bpy.context.window_manager.windows:
-        window.workspace.status_text_set(text if running() else None)
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES", "PROPERTIES"):
                 area.tag_redraw()

@@ -248,3 +248,29 @@ tell(labels=labels, state=state(), first=first, session=session)
     )
     assert told["labels"][0] == "first" and told["labels"][-1] == "19" and len(told["labels"]) == 8
     clean(told)
+
+
+def test_what_goes_wrong_on_our_side_ends_the_job_and_not_the_timer(installed):
+    told = installed(
+        HEAD
+        + f"""
+quick = [{sys.executable!r}, "-c", "print('{{\\"event\\": \\"done\\"}}')"]
+stage = lambda folder: process.Child(quick, {{}}, folder)
+def broken(*_):
+    raise RuntimeError("a lamp fell")
+said = []
+for stages, finish in (([stage, broken], None), ([stage], broken)):
+    job = jobs.start("x", stages, finish)
+    while job.state == "running":
+        jobs._look()
+        time.sleep(0.05)
+    jobs._look()
+    said.append([job.state, job.message, "lamp" in job.log_text()])
+tell(said=said, state=state(), first=first, session=session)
+"""
+    )
+    assert told["said"] == [
+        ["failed", "The next step cannot be started: RuntimeError: a lamp fell", True],
+        ["failed", "The result cannot be brought in: RuntimeError: a lamp fell", True],
+    ]
+    clean(told)
