@@ -195,7 +195,7 @@ def export(args: argparse.Namespace) -> int:
     import tempfile
 
     from .model.asset import read_ply, write_ply
-    from .model.formats import write_slice, write_slices
+    from .model.slices import write_slice, write_slices
     from .model.usd import SUFFIXES, check_usd, read_usd, write_usd
 
     usd = args.out is not None and args.out.suffix.lower() in SUFFIXES

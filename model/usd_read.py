@@ -13,7 +13,8 @@ import numpy as np
 
 from ..datagen.sequence import InputError
 from .asset import SH_C0, STATIC_SIGMA_T, Asset, Clip, check
-from .formats import MOST, SHARE, placed
+from .formats import MOST, SHARE
+from .slices import placed
 
 SPLAT = "ParticleField3DGaussianSplat"
 SH = "radiance:sphericalHarmonicsCoefficients"
