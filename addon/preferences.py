@@ -59,20 +59,21 @@ def get(context=None):
     return addon.preferences if addon else None
 
 
-def user_folder(name: str) -> Path:
-    """An existing folder for files of the add-on's own, kept between sessions."""
+def user_folder(name: str, create: bool = True) -> Path:
+    """A folder for files of the add-on's own, kept between sessions."""
     if ROOT.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(ROOT, path=name, create=True))
-    folder = bpy.utils.user_resource("DATAFILES", path=f"{ROOT}/{name}", create=True)
+        return Path(bpy.utils.extension_path_user(ROOT, path=name, create=create))
+    folder = bpy.utils.user_resource("DATAFILES", path=f"{ROOT}/{name}", create=create)
     if not folder:  # a home that cannot be written
         folder = Path(tempfile.gettempdir(), ROOT, name)
-        folder.mkdir(parents=True, exist_ok=True)
+        if create:
+            folder.mkdir(parents=True, exist_ok=True)
     return Path(folder)
 
 
 def runtime_folder() -> Path:
     """Where the installed runtime lies, a virtual environment, if there is one."""
-    return user_folder("runtime") / "venv"
+    return user_folder("runtime", create=False) / "venv"
 
 
 def runtime() -> dict | None:

@@ -252,7 +252,7 @@ def op(name, **options):
     except RuntimeError as e:
         return str(e)
 def left():
-    return sorted(x.name for n in ("runs", "runtime") for x in preferences.user_folder(n).iterdir())
+    return sorted(x.name for n in ("runs", "runtime") for x in preferences.user_folder(n, create=False).glob("*"))
 """
 WHOLE = """
 result = dict(offline=op("install_runtime"), refused=left())
