@@ -69,7 +69,7 @@ def request(chosen, context) -> dict:
         "layer": context.view_layer.name,
         "objects": [o.name for o in settings.objects(chosen, context)],
         "cameras": [o.name for o in cameras],
-        "frames": settings.frames(chosen, scene),
+        "frames": list(settings.frames(chosen, scene)),
         "in_turn": chosen.in_turn,
         "size": chosen.size,
         "samples": chosen.samples,

@@ -94,20 +94,20 @@ class TIMESPLAT_PG_settings(Settings, bpy.types.PropertyGroup):
 # ---------------------------------------------------------------- what they select
 
 
-def spread(first: int, last: int, count: int) -> list[int]:
+def spread(first: int, last: int, count: int) -> range:
     """At most `count` frame numbers from `first` on with one whole step between them, the smallest that
     comes within a step of `last`: an even step is what motion vectors and time need."""
     step = max(1, -(-(last - first) // max(count - 1, 1)))
-    return list(range(first, last + 1, step))[:count]
+    return range(first, last + 1, step)[:count]
 
 
-def frames(settings, scene) -> list[int]:
+def frames(settings, scene) -> range:
     """The scene frames to capture. Raises InputError for an empty range."""
     own = settings.frame_range == "CUSTOM"
     first, last = (settings.frame_start, settings.frame_end) if own else (scene.frame_start, scene.frame_end)
     if last < first:
         raise InputError(f"Frames {first} to {last}: the range is empty; let it end after its start.")
-    return list(range(first, last + 1, settings.every)) if settings.every else spread(first, last, AIM)
+    return range(first, last + 1, settings.every) if settings.every else spread(first, last, AIM)
 
 
 def objects(settings, context) -> list:

@@ -141,7 +141,7 @@ SELECT = """
 part("addon").register()
 settings = part("addon.settings")
 scene, chosen = bpy.context.scene, bpy.context.scene.timesplat
-ranges = [[settings.spread(1, e, n) for n in (1, 2, 8, 24)] for e in (1, 2, 24, 40, 250)]
+ranges = [[list(settings.spread(1, e, n)) for n in (1, 2, 8, 24)] for e in (1, 2, 24, 40, 250)]
 names = lambda: sorted(o.name for o in settings.objects(chosen, bpy.context))
 everything = names()
 bpy.ops.mesh.primitive_cube_add()
@@ -163,7 +163,7 @@ group.objects.link(cube)
 chosen.source, chosen.collection = "COLLECTION", "Group"
 collected = names()
 chosen.every = 7
-own = settings.frames(chosen, scene)
+own = list(settings.frames(chosen, scene))
 said = [settings.cameras(bpy.context)[1]]
 chosen.source = "SCENE"
 bpy.ops.timesplat.add_cameras(rig="ORBIT", count=5)
