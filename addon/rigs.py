@@ -77,14 +77,14 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
+        for ob in list(context.view_layer.objects.selected):
+            ob.select_set(False)
         if self.replace and (old := bpy.data.collections.get(settings.RIG)):
             data = [o.data for o in old.objects if o.type == "CAMERA" and o.data.users == 1]
             bpy.data.batch_remove([o for o in old.objects if o.type == "CAMERA"] + data)
         collection = bpy.data.collections.get(settings.RIG) or bpy.data.collections.new(settings.RIG)
         if settings.RIG not in scene.collection.children:
             scene.collection.children.link(collection)
-        for ob in context.view_layer.objects.selected:
-            ob.select_set(False)
         placed: dict[str, list] = {}
         for shot in shots(self.rig, self.count, math.degrees(self.elevation), self.distance, frames):
             placed.setdefault(shot.camera, []).append(Matrix(norm.to_world(shot.c2w).tolist()))
