@@ -143,6 +143,12 @@ def with_suffix(filepath: str, kind: str) -> str:
     return filepath + SUFFIX[kind]
 
 
+def kind_of(filepath: str, default: str) -> str:
+    """The format that a path's suffix stands for: `default` if that has it or the suffix is of no format."""
+    suffix = Path(filepath).suffix.lower()
+    return default if suffix in ("", SUFFIX[default]) else next((k for k, s in SUFFIX.items() if s == suffix), default)
+
+
 class TIMESPLAT_OT_export_asset(bpy.types.Operator):
     """Export the active 4D Gaussian asset: as .ply or .splat, or as USD"""
 
@@ -180,11 +186,15 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         if not self.filepath:
             folder = Path(bpy.data.filepath).parent if bpy.data.filepath else Path()
             self.filepath = str(folder / bpy.path.clean_name(context.object.name))
+        self.checked = ""
         self.check(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def check(self, context):
+        if self.format == self.checked:  # so that the name was changed: a suffix that is typed chooses the format
+            self.format = kind_of(self.filepath, self.format)
+        self.checked = self.format
         path = with_suffix(self.filepath, self.format)
         changed, self.filepath = path != self.filepath, path
         return changed
@@ -203,8 +213,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
     def execute(self, context):
         if not self.properties.is_property_set("format"):
-            kinds = [k for k, s in SUFFIX.items() if s == Path(self.filepath).suffix.lower()]
-            self.format = kinds[0] if kinds else "PLY"
+            self.format = kind_of(self.filepath, self.format)
         try:
             if not self.filepath:
                 raise InputError("No file was named; choose one.")

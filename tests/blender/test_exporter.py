@@ -262,11 +262,13 @@ part("addon").register()
 exporter = part("addon.exporter")
 menu = [d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs]
 part("addon").unregister()
-f = exporter.with_suffix
+f, k = exporter.with_suffix, exporter.kind_of
 tell(names=[f("/x/a", "USDZ"), f("/x/a.ply", "USDC"), f("/x/a.v2", "PLY"), f("/x/a.v2.USDA", "SLICES")],
+     typed=[k("a.usdz", "PLY"), k("a", "USDA"), k("a.v2", "USDA"), k("a.PLY", "SLICE"), k("a.ply", "SLICES")],
      kinds=sorted(exporter.SUFFIX) == sorted(i[0] for i in exporter.FORMAT_ITEMS), menu=menu,
      gone=[d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs])
 """
     told = blender(code)
     assert told["names"] == ["/x/a.usdz", "/x/a.usdc", "/x/a.v2.ply", "/x/a.v2"] and told["kinds"]
+    assert told["typed"] == ["USDZ", "USDA", "USDA", "SLICE", "PLY"]
     assert "timesplat.addon.exporter" in told["menu"] and "timesplat.addon.exporter" not in told["gone"]
