@@ -117,13 +117,15 @@ def _reconstruct(request: dict, progress) -> dict:
         if budget:
             parse(budget)
     checkpoint = request.get("checkpoint")
+    compiled = any(Path(__file__).parent.rglob("__pycache__/*.nbi"))  # numba's, of an earlier run
+    note = "" if compiled else "; the first run compiles, which takes half a minute"
     gaussians = reconstruct(
         sequence,
         method,
         indices=indices,
         device=request.get("device", "cpu"),
         checkpoint=Path(checkpoint) if checkpoint else None,
-        progress=lambda fraction, text: progress(0.05 + 0.9 * fraction, text),
+        progress=lambda fraction, text: progress(0.05 + 0.9 * fraction, text + note),
         refine=refine,
         budget=budget,
         max_loss=max_loss,
