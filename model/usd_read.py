@@ -20,6 +20,7 @@ SPLAT = "ParticleField3DGaussianSplat"
 SH = "radiance:sphericalHarmonicsCoefficients"
 VARIANTS = "representation"  # the variant set of files that hold the original object too
 RECONSTRUCTION, ORIGINAL = "reconstruction", "original"
+LONGEST = 100_000  # frames; more than an hour, and less than a damaged file may claim
 
 
 def pxr():
@@ -116,6 +117,16 @@ def _get(path: Path, prim, *names: str, code=None) -> np.ndarray:
     raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
 
 
+def _clip(path: Path, stage, start: float, end: float, pixel: float = 0.0) -> Clip:
+    """The whole frames around two time codes; the nearest one where they are the same."""
+    if not end - start < LONGEST:
+        raise InputError(f"{path}: its frames run from {start:g} to {end:g}, that is too many; export it again.")
+    first, last = int(np.floor(start + 1e-6)), int(np.ceil(end - 1e-6))
+    if start == end:
+        first = last = round(start)
+    return Clip(stage.GetTimeCodesPerSecond(), first, last, pixel=pixel)
+
+
 def _read_4d(path: Path, stage, prim) -> Asset:
     def get(*names: str) -> np.ndarray:
         return _get(path, prim, *names)
@@ -128,7 +139,8 @@ def _read_4d(path: Path, stage, prim) -> Asset:
     if prim.HasAttribute("gs4d:time"):
         start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # one sample, where the clip is one frame
     t, velocity, sigma_t = (get(f"primvars:gs4d:{name}") for name in ("mu_t", "velocity", "sigma_t"))
-    first, last = int(np.floor(start + 1e-6)), int(np.ceil(end - 1e-6))
+    clip = _clip(path, stage, start, end, pixel=prim.GetCustomDataByKey("timesplat:pixel") or 0.0)
+    first, last = clip.frame_start, clip.frame_end
     if last > first and (first, last) != (start, end):  # retimed to fractional frames
         stretch = np.float32((end - start) / (last - first))
         t = (t + 1) * stretch + np.float32(2 * (start - first) / (last - first) - 1)
@@ -142,7 +154,7 @@ def _read_4d(path: Path, stage, prim) -> Asset:
         rotation=rotation,
         rgb=rgb.astype(np.float32),
         opacity=get("primvars:gs4d:opacity"),
-        clip=Clip(stage.GetTimeCodesPerSecond(), first, last, pixel=prim.GetCustomDataByKey("timesplat:pixel") or 0.0),
+        clip=clip,
     )
 
 
@@ -150,8 +162,8 @@ def _read_others(path: Path, stage, prim) -> Asset:
     names = ("positions", "scales", "orientations", "opacities", SH)
     attributes = [prim.GetAttribute(k) for n in names for k in (n, f"{n}h")]
     codes = sorted({c for a in attributes if a for c in a.GetTimeSamples()})
-    first, last = (int(np.floor(codes[0])), int(np.ceil(codes[-1]))) if len(codes) > 1 else (0, 0)
-    clip = Clip(stage.GetTimeCodesPerSecond(), first, last)
+    clip = _clip(path, stage, codes[0], codes[-1]) if len(codes) > 1 else Clip(stage.GetTimeCodesPerSecond(), 0, 0)
+    first, last = clip.frame_start, clip.frame_end
     parts, total = [], 0
     for frame in clip.frames:
         code = frame if len(codes) > 1 else codes[0] if codes else None

@@ -394,6 +394,8 @@ def test_moving_splats_of_another_program_live_for_a_frame_each(tmp_path):
         (lambda stage, prim: UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, 1), 3), None),
         (lambda stage, prim: [UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, f), f) for f in (1,)]
          and [prim.GetAttribute("xformOp:translate").Set((0, 1, f), f) for f in (2, 3)], "/scan moves over time"),
+        (lambda stage, prim: [prim.GetAttribute("positions").Set([(0, 0, 0)] * 3, f) for f in (0, 1e9)],
+         "its frames run from 0 to 1e+09"),
         (lambda stage, prim: stage.DefinePrim("/scan2", SPLAT), "holds 2 assets (/scan, /scan2)"),
     ],
 )  # fmt: skip

@@ -224,6 +224,15 @@ def test_fractional_times_and_other_rates(page, fox, tmp_path, offset, scale, ra
         np.testing.assert_allclose(opacity, exact, atol=1e-4)
 
 
+def test_a_single_frame_between_two_frames(fox, tmp_path):
+    write_usd(tmp_path / "fox.usdc", replace(fox, clip=replace(CLIP, frame_start=5, frame_end=5)))
+    text = '#usda 1.0\n(upAxis = "Z"\nmetersPerUnit = 1)\ndef "a" (references = @./fox.usdc@ (offset = 0.4)) {}\n'
+    (tmp_path / "a.usda").write_text(text)
+    asset = read_usd(tmp_path / "a.usda")
+    assert asset.clip.frames == range(5, 6)
+    np.testing.assert_array_equal(asset.at(0)[0], fox.at(0)[0])
+
+
 def test_crowds(page, fox, capsys):
     path = str(page / "crowd.usda")
     stage = Usd.Stage.Open(path)
