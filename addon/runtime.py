@@ -150,23 +150,27 @@ def _make_venv(folder: Path) -> list[str]:
             f"{sys.executable}: this Python comes without venv and ensurepip (Debian and Ubuntu keep them in "
             f"python3-venv); install them, {ELSEWHERE}."
         )
-    options = [] if "ensurepip" in has else ["--without-pip"]
-    done = subprocess.run(
-        [sys.executable, "-I", "-m", "venv", *options, str(folder)], env=_env(), capture_output=True, text=True
-    )
-    _log(done.stdout + done.stderr)
     python = _python_in(folder)
-    if done.returncode or not python.exists():
-        if re.search(NO_ROOM, done.stdout + done.stderr):
-            raise Stop(_no_room(folder))
-        said = [x.strip() for x in (done.stdout + done.stderr).splitlines() if x.strip()]
-        raise Stop(
-            f"{sys.executable}: no virtual environment can be made with this Python "
-            f"({said[-1][:200] if said else 'it does not say why'}); reinstall Blender, {ELSEWHERE}."
-        )
-    if options:
-        return [sys.executable, "-I", "-m", "pip", "--python", str(python)]
-    return [str(python), "-I", "-m", "pip"]
+    commands = [[sys.executable, "-I", "-m", "venv", "--without-pip", str(folder)]]
+    if "ensurepip" in has:
+        commands.append([str(python), "-I", "-m", "ensurepip", "--default-pip"])
+    for command in commands:
+        try:
+            done = subprocess.run(command, env=_env(), capture_output=True, text=True)
+        except OSError as e:
+            done = subprocess.CompletedProcess(command, 1, "", str(e))
+        said = done.stdout + done.stderr
+        _log(said)
+        if done.returncode:
+            if re.search(NO_ROOM, said):
+                raise Stop(_no_room(folder))
+            last = said.strip().splitlines()[-1][:200] if said.strip() else f"code {done.returncode}"
+            raise Stop(
+                f"{sys.executable}: no virtual environment can be made with this Python ({last}); reinstall Blender, "
+                f"{ELSEWHERE}."
+            )
+    outside = [sys.executable, "-I", "-m", "pip", "--python", str(python)]
+    return [str(python), "-I", "-m", "pip"] if "ensurepip" in has else outside
 
 
 def _has_index(pip: list[str]) -> bool:
