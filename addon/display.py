@@ -231,10 +231,10 @@ class TIMESPLAT_PT_result(bpy.types.Panel):
             if group != panel:
                 panel, column = group, layout.column(align=True)
             column.prop(*found, text=name)
-        if context.scene.view_settings.view_transform != "Standard":
-            row = layout.row()
-            row.label(text="View transform changes the colours", icon="ERROR")
-            row.operator("timesplat.set_standard")
+        if (transform := context.scene.view_settings.view_transform) != "Standard":
+            column = layout.column(align=True)
+            column.label(text=f"{transform} changes the colours", icon="ERROR")
+            column.operator("timesplat.set_standard")
         column = layout.column(align=True)
         column.operator("timesplat.compare", icon="IMAGE_DATA")
         column.operator("timesplat.bake", icon="ACTION")
