@@ -15,7 +15,7 @@ from .test_display import expected_time
 
 START = """
 part("addon").register()
-display, nodes, edit = part("addon.display"), part("addon.nodes"), part("addon.edit")
+display, nodes, edit, held = (part(f"addon.{x}") for x in ("display", "nodes", "edit", "held"))
 asset_module = part("model.asset")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 asset, scene = asset_module.read_ply(sys.argv[1]), bpy.context.scene
@@ -105,11 +105,11 @@ def test_applied_sliders_show_the_same(start, tmp_path):
     for i, case in enumerate(cases):
         set_all({**base, **case})
         clips.append(save(edit.applied(ob), f"{out}/{i}.npz"))
-    order = edit._read(ob.data, "gs_order", 1, "value").tolist()
+    order = held.read(ob.data, "gs_order", 1, "value").tolist()
     shown = {}
     for frame in (10.0, 17.5):
         set_all({**base, **cases[5]})
-        position, mask = edit.shown(ob, frame)
+        position, mask = held.shown(ob, frame)
         shown[frame] = [position.tolist(), mask.tolist()]
     set_all({**base, "Repeat": "Loop"})
     loop = refused(edit.applied, ob)
@@ -277,7 +277,7 @@ told["name"], told["hidden"] = new.name, [ob.hide_get(), ob.hide_render, new.hid
 told["sliders"] = {n: nodes.get_input(display.sampler(new), n) for n in nodes.SLIDERS}
 told["clip"] = save(edit.asset_of(new), sys.argv[2] + "/new.npz")
 told["source"] = list(new["timesplat_source"])
-told["order"] = edit._read(ob.data, "gs_order", 1, "value").tolist()
+told["order"] = held.read(ob.data, "gs_order", 1, "value").tolist()
 bpy.context.view_layer.objects.active = ob
 told["empty"] = refused(bpy.ops.timesplat.bake, frame_start=5, frame_end=4)
 bpy.ops.timesplat.bake(frame_start=100, frame_end=120)
