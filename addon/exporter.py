@@ -220,8 +220,11 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
             path = Path(bpy.path.abspath(with_suffix(self.filepath, self.format)))
             with busy(context):
                 level, said = self.write(path, present(context.object, self.apply_sliders), context)
-        except (InputError, OSError) as e:  # the latter: no room for temporary files
+        except InputError as e:
             self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        except OSError as e:  # no room for temporary files
+            self.report({"ERROR"}, f"{e.filename or path}: it cannot be written ({e.strerror or e}); make room.")
             return {"CANCELLED"}
         self.report({level}, f"{path.name}: {said}")
         return {"FINISHED"}

@@ -144,8 +144,11 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
             paths = self.paths()
             with busy(context):
                 loaded = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
-        except (InputError, OSError) as e:  # the latter: no room for temporary files
+        except InputError as e:
             self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        except OSError as e:  # no room for temporary files
+            self.report({"ERROR"}, f"{e.filename or paths[0]}: it cannot be written ({e.strerror or e}); make room.")
             return {"CANCELLED"}
         asset, path = loaded.asset, paths[0]
         name = path.stem if len(paths) == 1 else path.parent.name

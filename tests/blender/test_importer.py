@@ -122,6 +122,11 @@ for key in ["worker", "direct"] if find("pxr") else ["worker"]:
 os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
 importer.importlib.util.find_spec = hidden
 result["python"] = load(filepath=sys.argv[1])
+def full(*a, **k):
+    raise OSError(28, "No space left on device", "/full/x")
+importer.tempfile.TemporaryDirectory, kept = full, importer.tempfile.TemporaryDirectory
+result["full"] = load(filepath=sys.argv[1])
+importer.tempfile.TemporaryDirectory = kept
 result["two"] = load(directory=".", files=[{"name": "a.usdz"}, {"name": "b.usdz"}])
 importer.importlib.util.find_spec = find
 tell(**result, left=os.listdir(os.environ["TMPDIR"]))
@@ -137,6 +142,7 @@ tell(**result, left=os.listdir(os.environ["TMPDIR"]))
         assert "damaged or not a USD file" in told[f"{key}_bad"]["error"]
         assert "no such file" in told[f"{key}_none"]["error"]
     assert "no such file" in told["python"]["error"] and "one by one" in told["two"]["error"]
+    assert told["full"]["error"] == "/full/x: it cannot be written (No space left on device); make room."
     assert not [n for n in told["left"] if n.startswith("timesplat-")]
 
 
