@@ -66,7 +66,13 @@ def reduced(
     g = refine(start, views, seconds, device, near=near, count=wanted, progress=told)
     with gradients():
         g = g.map(torch.clone)
-        return g[contribution(g, around(g, own(views))) > LEAST] if len(g) else g
+        if len(g) == 0:
+            return g
+        seen = contribution(g, around(g, own(views)))
+        if wanted and len(g) > wanted:  # a fit that was cut short had split some and not yet dropped others
+            keep = seen.topk(wanted).indices
+            g, seen = g[keep], seen[keep]
+        return g[seen > LEAST]
 
 
 def fewest(

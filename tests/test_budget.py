@@ -11,6 +11,7 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model import budget
 from timesplat.model.asset import read_ply
 from timesplat.model.budget import fewest, parse, reduced
+from timesplat.model.fuse import contribution
 from timesplat.model.lift import lift
 from timesplat.model.reconstruct import reconstruct_views
 from timesplat.model.refine import error
@@ -38,6 +39,16 @@ def test_a_share_is_kept_to(scene, near, monkeypatch):
     g = reduced(start, inputs, "5%", near=near)
     assert 0 < len(g) <= 0.05 * len(start)
     assert error(g, others) < 0.5 * error(g[:0], others)
+
+
+def test_a_fit_that_ends_early_keeps_to_the_number_too(scene, monkeypatch):
+    """It may have split Gaussians and not yet dropped others: those that show most stay."""
+    inputs, _ = scene
+    start = lift(inputs)[::7]
+    monkeypatch.setattr(budget, "refine", lambda g, *args, **options: g)
+    g = reduced(start, inputs, "50", near=True)
+    shown = contribution(start, budget.around(start, budget.own(inputs)))
+    assert len(g) == 50 and torch.equal(g.xyz, start.xyz[shown.topk(50).indices])
 
 
 def test_the_search_ends_where_twice_as_many_are_no_better(scene, monkeypatch):

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("datagen", "model", "addon")
 FILES = sorted([*ROOT.glob("*.py"), *(f for floor in FLOORS for f in (ROOT / floor).rglob("*.py"))])
 NAMES = [f.relative_to(ROOT).as_posix() for f in FILES]
-TORCH_FREE = ("datagen/", "addon/", "model/asset.py", "model/formats.py", "model/slices.py", "model/usd.py")
+TORCH_FREE = ("datagen/", "addon/", "model/asset.py", "model/formats.py", "model/slices.py", "model/usd")
 TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 
 
