@@ -272,3 +272,18 @@ tell(names=[f("/x/a", "USDZ"), f("/x/a.ply", "USDC"), f("/x/a.v2", "PLY"), f("/x
     assert told["names"] == ["/x/a.usdz", "/x/a.usdc", "/x/a.v2.ply", "/x/a.v2"] and told["kinds"]
     assert told["typed"] == ["USDZ", "USDA", "USDA", "SLICE", "PLY"]
     assert "timesplat.addon.exporter" in told["menu"] and "timesplat.addon.exporter" not in told["gone"]
+
+
+def test_installed_as_an_extension(installed, folder):
+    """From the .zip, by its operators alone: in, out as USD, in again."""
+    code = """
+folder = sys.argv[1] + os.sep
+ops, steps = bpy.ops.timesplat, []
+for kind, name in ("import", "in.ply"), ("export", "out.usdz"), ("import", "out.usdz"), ("export", "out.ply"):
+    steps.append(getattr(ops, kind + "_asset")(filepath=folder + name))
+tell(steps=[list(s) for s in steps], modules=[m for m in sys.modules if m.split(".")[0] in ("timesplat", "torch")])
+"""
+    pytest.importorskip("pxr")
+    told = installed(code, folder)
+    assert told["steps"] == [["FINISHED"]] * 4 and told["modules"] == []
+    same(read_ply(folder / "out.ply"), read_ply(folder / "in.ply"))
