@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The runtime's installation, with pip and virtual environments as they are, and packages of a few bytes."""
 
+import contextlib
 import importlib.util
 import json
 import os
 import re
+import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -59,22 +62,34 @@ def pip(index: Path) -> dict:
     return {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(index)}
 
 
+# As if this Python had no ensurepip: pip, which is slow to be put in place, then works from outside.
+QUICK = f"""
+import importlib.util, runpy
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name: None if name == "ensurepip" else find(name)
+runpy.run_path({str(SCRIPT)!r}, run_name="__main__")
+"""
+
+
 class Run:
     """One request to the script, with a folder of its own to work in, which goes as a Job's does."""
 
-    def __init__(self, tmp_path: Path, task: str, env: dict, **request) -> None:
+    def __init__(self, tmp_path: Path, task: str, env: dict, whole: bool = False, **request) -> None:
         self.folder, work = tmp_path / "user" / "venv", tmp_path / "work"
         work.mkdir(exist_ok=True)
         request = {"task": task, "folder": str(self.folder), "work": str(work), **request}
         clean = {k: v for k, v in os.environ.items() if not k.startswith("PIP_")}
-        done = subprocess.run(
-            [sys.executable, "-I", str(SCRIPT)],
-            input=json.dumps(request) + "\n", capture_output=True, text=True, timeout=120,
-            env={**clean, "TMPDIR": str(work), **env},
-        )  # fmt: skip
-        subprocess.run(["rm", "-rf", str(work)], check=True)
-        self.events = [json.loads(line) for line in done.stdout.splitlines()]
-        self.end, self.code, self.log = self.events[-1], done.returncode, done.stderr
+        with subprocess.Popen(
+            [sys.executable, "-I", *([str(SCRIPT)] if whole else ["-c", QUICK])],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**clean, "TMPDIR": str(work), **env}, start_new_session=True,
+        ) as process:  # fmt: skip
+            said, self.log = process.communicate(json.dumps(request) + "\n", timeout=120)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        shutil.rmtree(work, ignore_errors=True)
+        self.events = [json.loads(line) for line in said.splitlines()]
+        self.end, self.code = self.events[-1], process.returncode
 
 
 def test_installs_again_and_removes(tmp_path, index):
@@ -83,7 +98,7 @@ def test_installs_again_and_removes(tmp_path, index):
     for name in ("pip", "torch", "sitecustomize"):
         (poison / f"{name}.py").write_text("raise SystemExit('this should not have been found')")
     astray = {"PYTHONPATH": str(poison), "PIP_USER": "1", "PIP_TARGET": str(tmp_path / "target")}
-    first = Run(tmp_path, "install", pip(index) | astray, build="cpu")
+    first = Run(tmp_path, "install", pip(index) | astray, whole=True, build="cpu")
     assert first.code == 0, first.log
     told = first.end
     assert told["event"] == "done" and told["build"] == "cpu" and not (tmp_path / "target").exists()
@@ -113,8 +128,9 @@ def test_installs_again_and_removes(tmp_path, index):
     assert json.loads((first.folder / "timesplat.json").read_text())["versions"]["torch"] == "9.9"
     assert list((tmp_path / "user").iterdir()) == [first.folder]
 
+    taken = runtime.size(first.folder)
     gone = Run(tmp_path, "uninstall", {})
-    assert gone.code == 0 and gone.end["bytes"] > 1e6 and list((tmp_path / "user").iterdir()) == []
+    assert gone.code == 0 and gone.end["bytes"] == taken > 1e4 and list((tmp_path / "user").iterdir()) == []
     assert Run(tmp_path, "uninstall", {}).end == {"event": "done", "bytes": 0}
 
 
@@ -212,7 +228,7 @@ def test_it_goes_with_blender(tmp_path, index):
     request = {"task": "install", "folder": str(tmp_path / "venv"), "work": str(work), "build": "cpu", "watch": True}
     pipe = subprocess.PIPE
     with subprocess.Popen(
-        [sys.executable, "-I", str(SCRIPT)], stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, cwd=work,
+        [sys.executable, "-I", "-c", QUICK], stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, cwd=work,
         env={**os.environ, **pip(index)}, start_new_session=True,
     ) as process:  # fmt: skip
         process.stdin.write(json.dumps(request) + "\n")
