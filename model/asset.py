@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -174,7 +174,8 @@ def atomic(path: Path) -> Iterator[Path]:
         why = e.strerror or e
         raise InputError(f"{path}: it cannot be written ({why}); choose another place.") from None
     finally:
-        tmp.unlink(missing_ok=True)
+        with suppress(OSError):  # where the folder is a file, say
+            tmp.unlink(missing_ok=True)
 
 
 # ---------------------------------------------------------------- .ply

@@ -286,3 +286,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"a\.ply.*No space left"):
         write_ply(tmp_path / "a.ply", make(4))
     assert (tmp_path / "a.ply").read_bytes() == before and os.listdir(tmp_path) == ["a.ply"]
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(InputError, match=r"a\.ply: it cannot be written"):
+        write_ply(tmp_path / "file" / "a.ply", make(3))
