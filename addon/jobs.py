@@ -228,15 +228,18 @@ class TIMESPLAT_OT_cancel(_OfJob, bpy.types.Operator):
     """End what runs, or throw away what waits; the scene is as it was"""
 
     bl_idname = "timesplat.cancel"
-    bl_label = "Cancel Reconstruction"
+    bl_label = "Cancel Job"
 
     @classmethod
     def poll(cls, context):
         return any(job.state in ("running", "waiting") for job in JOBS)
 
     def invoke(self, context, event):
-        if event.type == "ESC" and (not running() or context.screen.is_animation_playing):
-            return {"PASS_THROUGH"}  # Esc means something else then
+        if event.type == "ESC":
+            mine = [job for job in running() if job.scene]  # an installation is not ended in passing
+            if not mine or context.screen.is_animation_playing:
+                return {"PASS_THROUGH"}  # Esc means something else then
+            self.number = mine[-1].number
         return self.execute(context)
 
     def execute(self, context):
