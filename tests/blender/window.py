@@ -184,6 +184,7 @@ class Window:
         subprocess.run(command, env=self.env, check=True, timeout=60, stdout=subprocess.DEVNULL)
 
     def move(self, x: float, y: float) -> None:
+        self.place = x, y
         self._run("xdotool", "mousemove", round(x), round(y))
 
     def click(self, x: float, y: float, button: int = 1, times: int = 1, keys: str = "") -> None:
@@ -203,6 +204,13 @@ class Window:
             self.move(x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps)
         time.sleep(0.2)
         self._run("xdotool", "mouseup", button)
+        time.sleep(0.3)
+
+    def wheel(self, steps: int) -> None:
+        """Turns the wheel where the mouse is: up, or down where `steps` is negative."""
+        for _ in range(abs(steps)):
+            self._run("xdotool", "click", 4 if steps > 0 else 5)
+            time.sleep(0.1)
         time.sleep(0.3)
 
     def key(self, *keys: str) -> None:
