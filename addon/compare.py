@@ -24,7 +24,7 @@ IMAGE = "Timesplat Compare"
 GAIN = 4  # the difference is shown this many times as strong
 
 
-def compare(ob, context=None, *, size: int = 256, samples: int = 16) -> tuple[np.ndarray, float]:
+def compare(ob, context=None, *, size: int = 256, samples: int = 8) -> tuple[np.ndarray, float]:
     """(height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made from, the asset, GAIN
     times their absolute difference; and the PSNR in dB over the whole picture. The view is the scene's camera's, or
     without one the 3D view's; `size` pixels is its longer side. What the asset was made from are the objects that
@@ -93,7 +93,8 @@ def _picture(context, objects: list, view: tuple, even: bool, size: int, samples
             if even:
                 capture._lights(stage, made)
             stage.render.use_multiview = False
-            stage.cycles.transparent_max_bounces = 2 * display.TRANSPARENT_BOUNCES
+            stage.cycles.transparent_max_bounces = 2 * display.TRANSPARENT_BOUNCES  # see nodes.splats_material
+            stage.cycles.min_transparent_bounces = stage.cycles.transparent_max_bounces  # no roulette: less noise
             camera = bpy.data.objects.new("timesplat", data)
             made.append(camera)
             camera.matrix_world = matrix
@@ -144,7 +145,7 @@ class TIMESPLAT_OT_compare(bpy.types.Operator):
     bl_options = {"REGISTER"}  # noqa: RUF012
 
     size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=256, min=16)
-    samples: IntProperty(name="Samples", description="Cycles samples a pixel", default=16, min=1)
+    samples: IntProperty(name="Samples", description="Cycles samples a pixel", default=8, min=1)
 
     poll = edit.TIMESPLAT_OT_delete.poll
 
