@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A real Blender with a window, by mouse and keyboard alone: from a fresh profile to a scrubbed, exported asset;
+and what an artist does while a Job runs. Pictures of every step go to TIMESPLAT_PICTURES, if it is set.
+
+What acts on Blender is only ever the mouse and the keyboard; `ask` looks and changes nothing (see window.py)."""
+
+import os
+import re
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from timesplat.model.asset import read_ply
+from timesplat.model.usd import check_usd
+
+from .helpers import REAL, TARGET
+from .window import Window, missing
+
+pytestmark = [
+    pytest.mark.skipif(not REAL, reason="TIMESPLAT_BLENDER names no Blender that has windows"),
+    pytest.mark.skipif(bool(missing(TARGET)), reason=f"no {missing(TARGET)} for a window"),
+]
+
+MONKEY = """
+for o in list(bpy.data.objects):
+    bpy.data.objects.remove(o)
+scene = bpy.context.scene
+scene.frame_start, scene.frame_end = 1, 12
+bpy.ops.mesh.primitive_monkey_add(size=2)
+ob = bpy.context.object
+ob.modifiers.new("Subdivision", "SUBSURF").render_levels = 1
+bpy.ops.object.shade_smooth()
+fur = bpy.data.materials.new("Fur")
+fur.use_nodes = True
+fur.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (0.8, 0.25, 0.08, 1)
+fur.diffuse_color = (0.8, 0.25, 0.08, 1)
+ob.data.materials.append(fur)
+for frame, height, turn in ((1, 0, -40), (6, 0.8, 0), (12, 0, 40)):
+    ob.location.z, ob.rotation_euler.z = height, np.radians(turn)
+    ob.keyframe_insert("location", frame=frame)
+    ob.keyframe_insert("rotation_euler", frame=frame)
+chosen = scene.timesplat
+chosen.size, chosen.samples, chosen.method, chosen.budget, chosen.refine = 64, 8, "lift", "ALL", 0
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+tell()
+"""
+JOBS = "[(j.state, j.fraction, j.text, j.message) for j in ours('addon.jobs').JOBS]"
+STATE = "[(s.name, s.frame_current, s.render.resolution_x, s.camera) for s in bpy.data.scenes], len(bpy.data.cameras)"
+ENDED = f"[s for s, *_ in {JOBS} if s not in ('running', 'waiting')]"
+
+
+@pytest.fixture
+def window(installed, tmp_path, request):
+    """window(*arguments, env={}) -> a Window on a profile with the extension. tmp_path/monkey.blend has Suzanne, who
+    hops and turns in twelve frames."""
+    installed(MONKEY, tmp_path / "monkey.blend")
+    (tmp_path / "home").mkdir()
+    env = {"HOME": str(tmp_path / "home")}
+    yield lambda *args, **more: Window(TARGET, tmp_path / "window", installed.user, *args, env={**env, **more})
+    if kept := os.environ.get("TIMESPLAT_PICTURES"):
+        shutil.copytree(tmp_path / "window/pictures", Path(kept) / request.node.name, dirs_exist_ok=True)
+
+
+def socket(name: str) -> str:
+    """Asks for the identifier of the asset's slider of this name."""
+    tree = "bpy.context.object.modifiers[0].node_group.interface.items_tree"
+    return f"[i.identifier for i in {tree} if i.name == {name!r}][0]"
+
+
+def processes(folder: Path) -> list[str]:
+    """What runs with its temporary files in a folder: Blender and all that it started."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if str(folder).encode() in (entry / "environ").read_bytes() and (entry / "cmdline").read_bytes():
+                found.append(f"{entry.name} {(entry / 'cmdline').read_bytes()[:200]}")
+        except OSError:
+            continue
+    return found
+
+
+def nothing_left(w: Window) -> None:
+    """No process of ours, and no file but what Blender itself leaves: autosaves, its shaders, its sound server's folder."""
+    assert processes(w.tmp) == []
+    ours = [p.name for p in w.tmp.iterdir() if not re.fullmatch(r"pulse-.*|blender|.*\.blend", p.name)]
+    runs = list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*"))
+    assert ours == [] and runs == []
+
+
+def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
+    with window() as w:
+        w.move(600, 400)
+        time.sleep(0.7)
+        w.picture("start")
+        w.key("Escape")  # the splash
+        w.key("ctrl+o")
+        w.choose(tmp_path / "monkey.blend")
+        w.wait_for("bpy.data.filepath and len(bpy.data.objects) == 1")
+        w.preferences(sys.executable)
+        assert w.ask("ours('addon.preferences').get().python") == sys.executable
+
+        w.sidebar()
+        w.press("preset='DRAFT'", across=0.15)
+        w.fill("timesplat.size", "56", top=300)
+        w.fill("timesplat.samples", "4", top=370)
+        assert w.ask("[bpy.context.scene.timesplat.size, bpy.context.scene.timesplat.samples]") == [56, 4]
+        w.picture("settings")
+        before = w.ask(STATE)
+        w.press("timesplat.reconstruct")
+        w.wait_for(f"{JOBS}[-1][1] > 0.1 and len(ours('addon.jobs').running()) == 1", 120)
+        w.picture("running")
+        w.wait_for(ENDED, 300)
+        assert w.ask(JOBS)[-1][0] == "done", w.ask(JOBS)
+        w.wait_for("bpy.context.object.get('timesplat')")
+        view = w.area("VIEW_3D")
+        w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
+        time.sleep(0.7)
+        w.key("shift+h", "Home")  # hides all but the result, and frames it
+        w.picture("done")
+        count = int(w.ask(JOBS)[-1][3].split()[0].replace(",", ""))
+        assert count > 200
+        assert w.ask(STATE) == before
+
+        # the whole clip across the timeline, then along it
+        timeline = w.region("DOPESHEET_EDITOR", "WINDOW")
+        x, y = timeline["x"], timeline["y"] + 9
+        w.move(x + timeline["w"] / 2, y + 15)
+        time.sleep(0.7)
+        w.key("Home")
+        seen = []
+        for share in (0.1, 0.35, 0.6, 0.85):
+            w.drag(x + timeline["w"] * (share - 0.05), y, x + timeline["w"] * share, y, steps=4)
+            seen.append(w.ask("bpy.context.scene.frame_current"))
+            w.picture(f"frame {seen[-1]}")
+        assert seen == sorted(set(seen)) and seen[0] < 4 and seen[-1] > 8
+        w.key("Right")
+        assert w.ask("bpy.context.scene.frame_current") == seen[-1] + 1
+        w.key("Left", "Left")
+        assert w.ask("bpy.context.scene.frame_current") == seen[-1] - 1
+
+        # a slider: the wheel brings the result's panel up
+        side = w.region("VIEW_3D", "UI")
+        w.move(side["x"] + 100, side["y"] + 500)
+        time.sleep(0.7)
+        w.wheel(-15)
+        cut = w.ask(socket("Opacity Cut"))
+        w.fill(cut, "0.3", across=0.7)
+        value = w.under(side["x"] + 0.7 * (side["w"] - 28), w.place[1])
+        assert float(value) == pytest.approx(0.3)
+        w.picture("opacity cut")
+        w.fill(cut, "0.05", across=0.7)
+
+        for name in ("out.ply", "out.usdz"):
+            w.menu("Export", "timesplat.export_asset")
+            w.choose(tmp_path / name)
+            w.wait_for(f"os.path.exists({str(tmp_path / name)!r})", 120)
+            w.picture(f"exported {name}")
+        assert w.ask("'torch' in sys.modules or 'timesplat' in sys.modules") is False
+        w.key("ctrl+s")
+        w.wait_for("not bpy.data.is_dirty")
+        w.key("ctrl+q")
+        assert w.process.wait(60) == 0
+    nothing_left(w)
+
+    asset = read_ply(tmp_path / "out.ply")
+    assert len(asset) == count and (asset.clip.frame_start, asset.clip.frame_end) == (1, 12)
+    heights = {}
+    for frame in (1, 6, 12):  # she hops
+        position, opacity = asset.at(asset.frame_to_time(frame))
+        world = position * asset.clip.scale + np.array(asset.clip.translation)
+        heights[frame] = np.average(world[:, 2], weights=opacity)
+        assert np.abs(world[opacity > 0.3]).max() < 2.2
+    assert heights[6] - heights[1] == pytest.approx(0.8, abs=0.25), heights
+    assert heights[6] - heights[12] == pytest.approx(0.8, abs=0.25), heights
+    assert check_usd(tmp_path / "out.usdz") == []
+
+
+def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
+    """Esc while pictures are rendered; the row's cross while the model runs; undo, saving; another file; quitting."""
+    shutil.copy(tmp_path / "monkey.blend", tmp_path / "other.blend")
+    with window(tmp_path / "monkey.blend", TIMESPLAT_PYTHON=sys.executable) as w:
+        region = w.sidebar()
+        x = region["x"] + 0.5 * (region["w"] - 28)
+        button = w.find("timesplat.reconstruct", x, 100, 400)
+        view = w.area("VIEW_3D")
+
+        def start(seen: str) -> None:
+            jobs = len(w.ask(JOBS))
+            w.click(x, button)
+            w.wait_for(f"len({JOBS}) == {jobs + 1} and {seen!r} in {JOBS}[-1][2]", 120)
+
+        def over_the_view(*keys: str) -> None:
+            w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
+            time.sleep(0.7)
+            w.key(*keys)
+
+        def alone() -> None:
+            w.wait_for("not ours('addon.jobs').running()")
+            time.sleep(0.5)
+            assert len(processes(w.tmp)) == 1, processes(w.tmp)  # Blender
+            assert list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*")) == []
+
+        start("rendering")
+        over_the_view("Escape")
+        w.wait_for(f"{JOBS}[-1][0] == 'cancelled'", 5)
+        alone()
+        w.picture("cancelled while rendering")
+
+        start("reconstruct")
+        cross = region["x"] + region["w"] - 45
+        w.click(cross, w.find("timesplat.cancel", cross, button + 10, button + 60))
+        w.wait_for(f"{JOBS}[-1][0] == 'cancelled'", 5)
+        alone()
+        w.picture("cancelled while reconstructing")
+
+        start("rendering")
+        over_the_view("g", "x", "1", "Return", "ctrl+z", "ctrl+shift+z", "ctrl+z", "ctrl+s")
+        w.picture("undone and saved while running")
+        assert w.ask(JOBS)[-1][0] == "running" and not w.ask("bpy.data.is_dirty")
+        w.wait_for(ENDED + "[2:]", 240)
+        assert w.ask(JOBS)[-1][0] == "done", w.ask(JOBS)
+        w.wait_for("bpy.context.object.get('timesplat')")
+        over_the_view("ctrl+z")
+        assert w.ask("[o.name for o in bpy.data.objects]") == ["Suzanne"]  # the result is one step of undo
+        over_the_view("ctrl+shift+z")
+        w.wait_for("len(bpy.data.objects) == 2")
+        over_the_view("ctrl+s")
+        alone()
+
+        start("rendering")
+        over_the_view("ctrl+o")
+        w.choose(tmp_path / "other.blend")
+        w.wait_for("bpy.data.filepath.endswith('other.blend')")
+        w.wait_for(f"{JOBS}[-1][0] == 'waiting'", 240)  # it came from another file: it waits to be asked for
+        w.sidebar()
+        w.picture("waiting in another file")
+        assert w.ask("len(bpy.data.objects)") == 1
+        w.click(cross - 46, w.find("timesplat.bring", cross - 46, button + 10, button + 60))
+        w.wait_for("bpy.context.object.get('timesplat')")
+        w.picture("brought in")
+        alone()
+
+        start("rendering")
+        over_the_view("ctrl+q")
+        time.sleep(2)
+        if w.process.poll() is None:
+            w.picture("quitting")
+            w.key("d")  # Don't Save
+        assert w.process.wait(60) == 0, w.said()
+    nothing_left(w)
