@@ -84,7 +84,7 @@ def processes(folder: Path) -> list[str]:
 
 
 def nothing_left(w: Window) -> None:
-    """No process of ours, and no file but what Blender itself leaves: autosaves, its shaders, its sound server's folder."""
+    """No process, and no file but what Blender itself leaves: autosaves, shaders, its sound server's folder."""
     assert processes(w.tmp) == []
     ours = [p.name for p in w.tmp.iterdir() if not re.fullmatch(r"pulse-.*|blender|.*\.blend", p.name)]
     runs = list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*"))
