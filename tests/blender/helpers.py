@@ -23,8 +23,10 @@ CLIP = Clip(23.976, 10, 33, 2.5, (1.0, -2.0, 3.0), pixel=0.03)
 EXTENSION = "bl_ext.user_default.timesplat"
 
 HEAD = """
-import importlib, importlib.util, json, os, sys
+import atexit, importlib, importlib.util, json, os, sys
 import bpy, numpy as np
+if bpy.app.version < (4, 5) and not bpy.app.binary_path:
+    atexit.register(os._exit, 0)  # last of all: that wheel crashes on its way out where a panel is registered
 if "--" in sys.argv:  # Blender's own arguments stand before it
     sys.argv[1:] = sys.argv[sys.argv.index("--") + 1:]
 def tell(**d): print("RESULT" + json.dumps(d), flush=True)
