@@ -5,12 +5,11 @@
     bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame
 
 What the sliders do and what was deleted is in the file, and so is the object's place in the world at the current
-frame. USD is written with the pxr of this Python, or by the worker in Blenders that have none.
+frame. USD is written by the worker, or where there is none with the pxr of Blender's own Python.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,7 +58,8 @@ def present(ob, apply_sliders: bool) -> Asset:
 
 def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, context) -> list[str]:
     """Writes and validates; returns what the validators complain about. Raises InputError."""
-    if importlib.util.find_spec("pxr"):
+    python = preferences.usd_python(context)
+    if not python:
         usd.write_usd(path, asset, mode=mode, half=half, original=original)
         return usd.check_usd(path)
     with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
@@ -67,7 +67,7 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
         write_ply(copy, asset)
         request = {"task": "export", "asset": str(copy), "out": str(path.resolve()), "mode": mode, "half": half}
         request |= {"original": str(original)} if original else {}
-        return process.ask(preferences.worker_python(context), request)["complaints"]
+        return process.ask(python, request)["complaints"]
 
 
 @contextmanager

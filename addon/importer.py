@@ -5,12 +5,11 @@
     bpy.ops.timesplat.import_asset(filepath="folder/")                                its .ply files, one a frame
     bpy.ops.timesplat.import_asset(directory="folder", files=[{"name": "a.ply"}, …])  these, one a frame
 
-USD is read with the pxr of this Python, or by the worker in Blenders that have none.
+USD is read by the worker, or where there is none with the pxr of Blender's own Python.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import tempfile
 from contextlib import contextmanager
@@ -46,14 +45,15 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> fo
     if len(paths) > 1:
         raise InputError("USD files hold their frames themselves; import them one by one.")
     (path,) = paths
-    if importlib.util.find_spec("pxr"):
-        return formats.Loaded(usd.read_usd(path), "Z")
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name.")
+    python = preferences.usd_python(context)
+    if not python:
+        return formats.Loaded(usd.read_usd(path), "Z")
     with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
         copy = Path(folder) / "asset.ply"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy)}
-        process.ask(preferences.worker_python(context), request)
+        process.ask(python, request)
         return formats.Loaded(read_ply(copy), "Z")
 
 

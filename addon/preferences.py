@@ -114,6 +114,17 @@ def worker_python(context=None) -> str:
     )
 
 
+def usd_python(context=None) -> str | None:
+    """The interpreter that reads and writes USD: the worker's, which knows splats and has their validator, and where
+    a damaged file harms nothing; None where there is none, but Blender's own has pxr. Raises InputError otherwise."""
+    try:
+        return worker_python(context)
+    except InputError:
+        if importlib.util.find_spec("pxr"):
+            return None
+        raise
+
+
 def checkpoint(context=None) -> str | None:
     """The weights that the preferences name; None: those that come with Timesplat. Raises InputError."""
     preferences = get(context)

@@ -150,10 +150,9 @@ def test_usd_is_written_checked_and_read_again(blender, folder):
 
     code = """
 import importlib.util
-exporter, find = part("addon.exporter"), importlib.util.find_spec
-result = {}
-for key in ["worker", "direct"] if find("pxr") else ["worker"]:
-    exporter.importlib.util.find_spec = (lambda n: None if n == "pxr" else find(n)) if key == "worker" else find
+result, named = {}, os.environ["TIMESPLAT_PYTHON"]
+for key in ["worker", "direct"] if importlib.util.find_spec("pxr") else ["worker"]:
+    os.environ["TIMESPLAT_PYTHON"] = named if key == "worker" else "/nowhere/python"
     for n, options in {"a.usdc": {}, "b.usdz": {"half": True}, "c.usda": {"mode": "points"}, "d": {"format": "USDC",
                        "mode": "frames"}}.items():
         result[key + "_" + n] = [save(key + "_" + n, **options), bpy.data.texts["Timesplat USD report"].as_string()]

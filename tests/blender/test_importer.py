@@ -98,7 +98,7 @@ tell(**result)
 
 
 def test_usd_through_the_worker_and_directly(blender, tmp_path):
-    """With pxr hidden the worker reads it; the arrays are the same."""
+    """Where there is no worker Blender's own pxr reads it; the arrays are the same."""
     usd = pytest.importorskip("timesplat.model.usd")
     pytest.importorskip("pxr")
     asset = make(50)
@@ -109,26 +109,27 @@ def test_usd_through_the_worker_and_directly(blender, tmp_path):
         + """
 from pathlib import Path
 importer, find = part("addon.importer"), importlib.util.find_spec
-result = {}
+result, named = {}, os.environ["TIMESPLAT_PYTHON"]
 def hidden(name):
-    return None if name == "pxr" else find(name)
+    return None if name in ("pxr", "torch") else find(name)
 for key in ["worker", "direct"] if find("pxr") else ["worker"]:
-    importer.importlib.util.find_spec = hidden if key == "worker" else find
+    os.environ["TIMESPLAT_PYTHON"] = named if key == "worker" else "/nowhere/python"
     result[key] = load(filepath=sys.argv[1])
     got = importer.read([Path(sys.argv[1])], fps=24, frame_start=1)
     part("model.asset").write_ply(sys.argv[3] + key + ".ply", got.asset)
     result[key + "_bad"] = load(filepath=sys.argv[2])
     result[key + "_none"] = load(filepath=sys.argv[2] + "c.usdc")
 os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
-importer.importlib.util.find_spec = hidden
+importlib.util.find_spec = hidden
 result["python"] = load(filepath=sys.argv[1])
+os.environ["TIMESPLAT_PYTHON"] = named
 def full(*a, **k):
     raise OSError(28, "No space left on device", "/full/x")
 importer.tempfile.TemporaryDirectory, kept = full, importer.tempfile.TemporaryDirectory
 result["full"] = load(filepath=sys.argv[1])
 importer.tempfile.TemporaryDirectory = kept
 result["two"] = load(directory=".", files=[{"name": "a.usdz"}, {"name": "b.usdz"}])
-importer.importlib.util.find_spec = find
+importlib.util.find_spec = find
 tell(**result, left=os.listdir(os.environ["TMPDIR"]))
 """
     )
