@@ -5,9 +5,8 @@
     blender -b --python benchmarks/display.py             the same in any Blender
     blender --python benchmarks/display.py                with a window: panels and redraws too; ends Blender
 
-A frame change is scene.frame_set, which evaluates the modifier; a panel's row is what one draw of the sidebar costs
-on that tab (all of Blender's own work included), and what the add-on's draw() functions take of it. Each is the median
-of REPEATS.
+A frame change is scene.frame_set, which evaluates the modifier. draw() is what the add-on's panels add to a redraw of
+the sidebar. Each is the median of REPEATS.
 """
 
 import importlib.util
@@ -84,79 +83,74 @@ def biggest():
     return max((a for a in areas if a.type == "VIEW_3D"), key=lambda a: a.width * a.height)
 
 
-def windowed() -> list[tuple[str, float]]:
-    """Draws of the sidebar and of the viewport."""
+def windowed():
+    """Yields seconds to wait for Blender's own redraws; returns rows."""
     window, area = bpy.context.window_manager.windows[0], biggest()
     regions = {r.type: r for r in area.regions}
-    rows, spent = [], [0.0]
+    rows, calls = [], {}
 
     def timed(draw):
         def inner(self, context):
             start = time.perf_counter()
             draw(self, context)
-            spent[0] += 1e3 * (time.perf_counter() - start)
+            calls.setdefault(self.bl_label, []).append(1e3 * (time.perf_counter() - start))
 
         return inner
 
-    ours = [c for c in bpy.types.Panel.__subclasses__() if c.__module__.startswith("timesplat.")]
-    for panel in ours:
-        panel.draw = timed(panel.draw)
+    for panel in bpy.types.Panel.__subclasses__():
+        if panel.__module__.startswith("timesplat."):
+            panel.draw = timed(panel.draw)
+    regions["UI"].active_panel_category = "Timesplat"
+    for _ in range(REPEATS):
+        regions["UI"].tag_redraw()
+        yield 0.05
+    rows += [
+        (f"draw() of the panel {name}, {len(times)} times", statistics.median(times)) for name, times in calls.items()
+    ]
+    rows.append(("draw() of all panels", sum(row[1] for row in rows)))
 
-    def drawn(region, kind="DRAW"):
-        def act(i):
-            with bpy.context.temp_override(window=window, area=area, region=region):
-                bpy.ops.wm.redraw_timer(type=kind, iterations=1)
+    def redraw(i):
+        with bpy.context.temp_override(window=window, area=area, region=regions["WINDOW"]):
+            bpy.ops.wm.redraw_timer(type="DRAW_SWAP", iterations=1)
 
-        return act
-
-    for tab in ("View", "Timesplat"):
-        regions["UI"].active_panel_category = tab
-        drawn(regions["UI"])(0)
-        spent[0] = 0.0
-        rows.append((f"sidebar, tab {tab}", median(drawn(regions["UI"]))))
-        rows.append((f"  of it draw() of the add-on, {len(ours)} panels", spent[0] / (REPEATS + 1)))
-    space = area.spaces.active
     for shading in ("SOLID", "MATERIAL"):
-        space.shading.type = shading
-        for _ in range(3):
-            drawn(regions["WINDOW"], "DRAW_SWAP")(0)  # shaders are compiled
-        rows.append((f"viewport {shading.lower()}, {area.width}x{area.height}", median(drawn(regions["WINDOW"]))))
+        area.spaces.active.shading.type = shading
+        yield 5  # shaders are compiled
+        rows.append((f"redraw of the viewport, {shading.lower()}, {area.width}x{area.height}", median(redraw)))
     return rows
 
 
-def main() -> None:
+def made():
+    """The asset's object, beside whatever the start-up scene holds, with the add-on registered."""
     from timesplat.addon import display, register
 
     register()
-    bpy.ops.object.select_all(action="DESELECT")
-    ob = display.add_asset(asset(), "benchmark", look="Points")
-    rows = frame_changes(ob)
-    if not bpy.app.background:
-        rows += windowed()
+    return display.add_asset(asset(), "benchmark", look="Points")
+
+
+def report(rows) -> None:
     print(f"\nBlender {bpy.app.version_string}, {COUNT:,} Gaussians, median of {REPEATS}")
     print("| what | milliseconds |\n| --- | --- |")
     for name, value in rows:
-        print(f"| {name} | {value:.2f} |")
+        print(f"| {name} | {value:.2f} |", flush=True)
 
 
 def in_window():
-    """Once the window is there: opens the sidebar, waits for it, measures, ends."""
-    area = biggest()
-    area.spaces.active.show_region_ui = True
-
-    def measure():
-        try:
-            main()
-        finally:
-            bpy.ops.wm.quit_blender()
-
-    bpy.app.timers.register(measure, first_interval=1)
+    """Yields seconds to wait: the window comes, the sidebar gets to know its tabs, panels are drawn."""
+    yield 1
+    ob = made()
+    biggest().spaces.active.show_region_ui = True
+    yield 3
+    rows = frame_changes(ob)
+    report(rows + (yield from windowed()))
+    bpy.ops.wm.quit_blender()
 
 
 if __name__ == "__main__":
     package()
     if bpy.app.background:
-        main()
+        report(frame_changes(made()))
         sys.modules["timesplat.addon"].unregister()
     else:
-        bpy.app.timers.register(in_window, first_interval=1)
+        steps = in_window()
+        bpy.app.timers.register(lambda: next(steps, None))
