@@ -11,7 +11,7 @@ import pytest
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
-from timesplat.model.asset import linear_from_srgb, read_ply, rotation_matrices, write_ply
+from timesplat.model.asset import SH_C0, linear_from_srgb, read_ply, rotation_matrices, write_ply
 
 from .helpers import make
 
@@ -31,7 +31,7 @@ def shown(ob, *names):
                 attribute.data.foreach_get(key, a)
                 out[name] = (a.reshape(-1, width) if width > 1 else a).tolist()
             out["world"] = [list(i.matrix_world @ p.co) for p in data.points][:5]
-            out["material"] = data.materials[0].name if len(data.materials) else ""
+            out["material"] = data.materials[0].name if len(data.materials) and data.materials[0] else ""
             return out
     return {}
 """
@@ -183,6 +183,87 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
     for frame, offset in (("10", 0), ("20", 10), ("30", 20), ("55", 20)):
         position, opacity = asset.at(np.clip(asset.frame_to_time(float(frame) - offset), -1, 1))
         np.testing.assert_allclose(told["out"][frame]["position"], position[opacity >= 0.05], atol=1e-4)
+
+
+PANEL = """
+import types
+display, nodes = part("addon.display"), part("addon.nodes")
+bpy.ops.wm.read_factory_settings(use_empty=True)
+ob = display.add_asset(part("model.asset").read_ply(sys.argv[1]), "a")
+drawn, buttons, labels = {}, [], []
+class Layout:
+    def row(self, **_): return self
+    column = row
+    def label(self, text="", **_): labels.append(text)
+    def operator(self, name, **_): buttons.append(name)
+    def operator_menu_enum(self, name, key, **_): buttons.append(name)
+    def prop(self, owner, key, text=""):
+        if key == "value":
+            owner.bl_rna.properties[key]
+        else:
+            owner.path_resolve(key)
+        drawn[text] = key
+panel = types.SimpleNamespace(layout=Layout())
+scene = bpy.context.scene
+for transform in ("AgX", "Standard"):
+    scene.view_settings.view_transform = transform
+    buttons.clear()
+    display.TIMESPLAT_PT_result.draw(panel, bpy.context)
+    if transform == "AgX":
+        warned = list(buttons)
+scene.view_settings.view_transform = "AgX"
+part("addon").register()
+bpy.ops.timesplat.set_standard()
+poll = [display.TIMESPLAT_PT_result.poll(bpy.context)]
+bpy.ops.object.delete()
+poll.append(display.TIMESPLAT_PT_result.poll(bpy.context))
+tell(drawn=list(drawn), sliders=list(nodes.SLIDERS), warned=warned, buttons=buttons, labels=labels, poll=poll,
+     transform=scene.view_settings.view_transform)
+part("addon").unregister()
+"""
+
+
+def test_the_panel_shows_the_modifiers_own_sliders(blender, tmp_path):
+    write_ply(tmp_path / "a.ply", make(1234))
+    told = blender(PANEL, tmp_path / "a.ply")
+    assert told["drawn"] == told["sliders"] and told["labels"][0] == "1,234 Gaussians"
+    assert "timesplat.set_standard" in told["warned"] and "timesplat.set_standard" not in told["buttons"]
+    assert {"timesplat.compare", "timesplat.bake", "timesplat.delete"} <= set(told["buttons"])
+    assert told["transform"] == "Standard" and told["poll"] == [True, False]
+
+
+NATIVE = """
+display, nodes, asset = part("addon.display"), part("addon.nodes"), part("model.asset").read_ply(sys.argv[1])
+if bpy.app.version < (5, 2):
+    tell(old=True)
+    sys.exit()
+bpy.ops.wm.read_factory_settings(use_empty=True)
+ob = display.add_asset(asset, "a", look="Points", cut=0.05)
+if not nodes.NATIVE:  # what Blender 5.3 has in the group
+    display.write_attributes(ob.data, nodes.native_attributes(asset))
+tree = display.sampler(ob).node_group = display.sampler(ob).node_group.copy()
+n = nodes.Nodes(tree)
+placed, end = (next(x for x in tree.nodes if x.bl_idname == k) for k in ("GeometryNodeSetPosition", "NodeGroupOutput"))
+n.put(end.inputs[0], nodes.native(n, placed.outputs[0]))
+bpy.context.scene.frame_set(20, subframe=0.5)
+tell(old=False, got=shown(ob, "position", "scale", "rotation", "radiance:base"))
+"""
+
+
+def test_blenders_own_splats_get_the_attributes_that_they_are_known_by(blender, tmp_path):
+    """Names, types and meanings as Blender 5.3's importers write them; 5.2 has the types already, not the looks."""
+    write_ply(tmp_path / "a.ply", make())
+    told = blender(READ + NATIVE, tmp_path / "a.ply")
+    if told["old"]:
+        pytest.skip("before Blender 5.2 there are no attributes of four numbers")
+    asset, got = read_ply(tmp_path / "a.ply"), told["got"]
+    position, opacity = asset.at(asset.frame_to_time(20.5))
+    seen = opacity >= 0.05
+    np.testing.assert_allclose(got["position"], position[seen], atol=1e-5)
+    np.testing.assert_allclose(got["scale"], asset.soft_scale()[seen], rtol=1e-5)
+    np.testing.assert_allclose(got["rotation"], asset.rotation[seen], atol=1e-6)
+    base = np.concatenate([(asset.rgb - 0.5) / SH_C0, opacity[:, None]], 1)[seen]
+    np.testing.assert_allclose(got["radiance:base"], base, atol=1e-5)
 
 
 FOLLOW = """
