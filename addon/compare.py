@@ -32,6 +32,8 @@ def compare(ob, context=None, *, size: int = 256, samples: int = 8) -> tuple[np.
     nothing to compare with."""
     context = context or bpy.context
     scene = context.scene
+    if not hasattr(scene, "cycles"):
+        raise InputError("Cycles, which renders the comparison, is switched off; enable it in the preferences.")
     names = ob.get("timesplat_source")
     if names is not None:
         originals = [scene.objects[name] for name in names if name in scene.objects]
@@ -93,8 +95,8 @@ def _picture(context, objects: list, view: tuple, even: bool, size: int, samples
             if even:
                 capture._lights(stage, made)
             stage.render.use_multiview = False
-            stage.cycles.transparent_max_bounces = 2 * display.TRANSPARENT_BOUNCES  # see nodes.splats_material
-            stage.cycles.min_transparent_bounces = stage.cycles.transparent_max_bounces  # no roulette: less noise
+            stage.cycles.transparent_max_bounces = display.TRANSPARENT_BOUNCES
+            stage.cycles.min_transparent_bounces = display.TRANSPARENT_BOUNCES  # no roulette: less noise
             camera = bpy.data.objects.new("timesplat", data)
             made.append(camera)
             camera.matrix_world = matrix

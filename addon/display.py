@@ -37,7 +37,7 @@ __all__ = ["LOOKS", "add_asset", "follow", "is_asset", "play_clip", "sampler", "
 
 REACH = 3.0  # radius of a splat's sphere in σ
 THINNEST = 1e-3  # σ of the shader's splats is at least this times the largest one, for float32's sake
-TRANSPARENT_BOUNCES = 512  # how many splats a ray may pass
+TRANSPARENT_BOUNCES = 1024  # how many surfaces a ray may pass; a splat is one, in Cycles without Embree two
 
 
 def add_asset(asset: Asset, name: str, *, look: str = "Automatic", cut: float = VISIBLE, context=None):
@@ -94,7 +94,7 @@ def point_cloud(xyz: np.ndarray, name: str, context):
     if ob.name not in context.view_layer.objects:  # the active collection is excluded from the view layer
         context.collection.objects.unlink(ob)
         context.scene.collection.objects.link(ob)
-    for other in context.view_layer.objects.selected:
+    for other in filter(None, context.view_layer.objects.selected):  # None: one that a script has just removed
         other.select_set(False)
     ob.hide_set(False)
     ob.select_set(True)
@@ -205,12 +205,24 @@ class TIMESPLAT_OT_set_standard(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class TIMESPLAT_PT_result(bpy.types.Panel):
+class TIMESPLAT_OT_show_colours(bpy.types.Operator):
+    """Switch this 3D view to Material Preview, which has colours; Solid shows point clouds in grey"""
+
+    bl_idname = "timesplat.show_colours"
+    bl_label = "Show Colours"
+
+    @classmethod
+    def poll(cls, context):
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+    def execute(self, context):
+        context.space_data.shading.type = "MATERIAL"
+        return {"FINISHED"}
+
+
+class _Result:
     bl_label = "Result"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "Timesplat"
-    bl_order = 10
+    bl_region_type = "WINDOW"
 
     @classmethod
     def poll(cls, context):
@@ -231,6 +243,8 @@ class TIMESPLAT_PT_result(bpy.types.Panel):
             if group != panel:
                 panel, column = group, layout.column(align=True)
             column.prop(*found, text=name)
+        if context.area.type == "VIEW_3D" and context.space_data.shading.type in ("SOLID", "WIREFRAME"):
+            layout.operator("timesplat.show_colours", icon="SHADING_RENDERED")
         if (transform := context.scene.view_settings.view_transform) != "Standard":
             column = layout.column(align=True)
             column.label(text=f"{transform} changes the colours", icon="ERROR")
@@ -240,9 +254,27 @@ class TIMESPLAT_PT_result(bpy.types.Panel):
         column.operator("timesplat.bake", icon="ACTION")
         column.operator("timesplat.delete_rectangle", icon="SELECT_SET")
         column.operator_menu_enum("timesplat.delete", "what", text="Delete", icon="TRASH")
+        column.operator("timesplat.export_asset", text="Export", icon="EXPORT")
 
 
-CLASSES = (TIMESPLAT_OT_set_standard, TIMESPLAT_PT_result)
+class TIMESPLAT_PT_result(_Result, bpy.types.Panel):
+    bl_space_type, bl_region_type = "VIEW_3D", "UI"
+    bl_category = "Timesplat"
+    bl_order = 10
+
+
+class TIMESPLAT_PT_result_properties(_Result, bpy.types.Panel):
+    bl_label = "Timesplat"
+    bl_space_type = "PROPERTIES"
+    bl_context = "data"
+
+
+CLASSES = (
+    TIMESPLAT_OT_set_standard,
+    TIMESPLAT_OT_show_colours,
+    TIMESPLAT_PT_result,
+    TIMESPLAT_PT_result_properties,
+)
 
 
 def register() -> None:

@@ -53,7 +53,7 @@ def keep(ob, mask: np.ndarray, context=None) -> None:
         kept.append((attribute.name, attribute.data_type, key, values.reshape(len(mask), -1)[mask]))
     xyz = next(values for name, _, _, values in kept if name == "position")
 
-    active, selected = context.view_layer.objects.active, list(context.view_layer.objects.selected)
+    active, selected = context.view_layer.objects.active, [o for o in context.view_layer.objects.selected if o]
     helper = display.point_cloud(xyz, old.name, context)  # a PointCloud cannot be resized before Blender 5.2
     new = helper.data
     for name, kind, key, values in kept:
@@ -61,8 +61,8 @@ def keep(ob, mask: np.ndarray, context=None) -> None:
         attribute.data.foreach_set(key, values.ravel())
     for material in old.materials:
         new.materials.append(material)
-    for key in old.keys():  # noqa: SIM118
-        new[key] = old[key]
+    for key, value in old.items():
+        new[key] = value.to_dict() if hasattr(value, "to_dict") else value
     name = old.name
     old.user_remap(new)
     bpy.data.objects.remove(helper)
@@ -255,9 +255,9 @@ def baked(ob, frames: tuple[int, int], context=None):
     asset, s = applied(ob, frames), sliders(ob)
     new = display.add_asset(asset, f"{ob.name} baked", look=s["Look"], cut=s["Opacity Cut"], context=context)
     nodes.set_input(display.sampler(new), "Point Size", s["Point Size"])
-    for key in ob.keys():  # noqa: SIM118
-        if key != "timesplat_clip":
-            new[key] = ob[key]
+    for key, value in ob.items():
+        if key.startswith("timesplat_") and key != "timesplat_clip":
+            new[key] = value
     if ob.animation_data or ob.constraints:
         new.parent = ob
         new.matrix_basis = Matrix()

@@ -82,6 +82,24 @@ def test_an_object_gives_the_asset_back(start, tmp_path):
     assert "gs_t" in told["broken"] and "\n" not in told["broken"] and "no Timesplat asset" in told["camera"]
 
 
+def test_an_object_of_an_older_version_gives_its_asset_too(start, tmp_path):
+    """It has no note of its clip and no order; its place and its modifier say the clip."""
+    code = """
+    del ob["timesplat_clip"]
+    ob.data.attributes.remove(ob.data.attributes["gs_order"])
+    ob.modifiers[0].node_group = group = ob.modifiers[0].node_group.copy()
+    group.name = "Timesplat 1"
+    for item in list(group.interface.items_tree):
+        if item.item_type == "SOCKET" and item.name in ("Repeat", "Time Scale", "Crop"):
+            group.interface.remove(item)
+    clip = save(edit.applied(ob), sys.argv[2] + "/old.npz")
+    tell(clip=clip, fps=scene.render.fps, repeat=nodes.get_input(display.sampler(ob), "Repeat"))
+    """
+    asset, told = start(code, make(50, clip=Clip(24, 10, 33, 2.5, (1.0, -2.0, 3.0))))
+    assert told["clip"] == [told["fps"], 10, 33, 2.5, [1.0, -2.0, 3.0], 0.0] and told["repeat"] == "Hold"
+    assert np.array_equal(load(tmp_path / "old.npz")["xyz"], asset.xyz)
+
+
 CASES = [
     ({}, (10, 33)),
     ({"Time Offset": 5.0}, (15, 38)),
