@@ -243,7 +243,8 @@ class _Result:
             if group != panel:
                 panel, column = group, layout.column(align=True)
             column.prop(*found, text=name)
-        if context.area.type == "VIEW_3D" and context.space_data.shading.type in ("SOLID", "WIREFRAME"):
+        space = context.space_data
+        if space and space.type == "VIEW_3D" and space.shading.type in ("SOLID", "WIREFRAME"):
             layout.operator("timesplat.show_colours", icon="SHADING_RENDERED")
         if (transform := context.scene.view_settings.view_transform) != "Standard":
             column = layout.column(align=True)
