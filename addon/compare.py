@@ -21,15 +21,16 @@ from ..datagen.sequence import InputError
 from . import display, edit
 
 IMAGE = "Timesplat Compare"
+SPLAT_SAMPLES = 2  # splats are smooth and glow by themselves: more samples change next to nothing
 GAIN = 4  # the difference is shown this many times as strong
 
 
-def compare(ob, context=None, *, size: int = 256, samples: int = 8) -> tuple[np.ndarray, float]:
+def compare(ob, context=None, *, size: int = 256, samples: int = 16) -> tuple[np.ndarray, float]:
     """(height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made from, the asset, GAIN
     times their absolute difference; and the PSNR in dB over the whole picture. The view is the scene's camera's, or
-    without one the 3D view's; `size` pixels is its longer side. What the asset was made from are the objects that
-    `timesplat_source` names, else all that renders show but assets. Raises InputError where there is no view or
-    nothing to compare with."""
+    without one the 3D view's; `size` pixels is its longer side, `samples` are the original's. What the asset was made
+    from are the objects that `timesplat_source` names, else all that renders show but assets. Raises InputError where
+    there is no view or nothing to compare with."""
     context = context or bpy.context
     scene = context.scene
     if not hasattr(scene, "cycles"):
@@ -47,7 +48,7 @@ def compare(ob, context=None, *, size: int = 256, samples: int = 8) -> tuple[np.
     view = _camera(context)
     try:
         truth = _picture(context, [*originals, *lights], view, even, size, samples)
-        asset = _picture(context, [ob], view, even, size, samples)
+        asset = _picture(context, [ob], view, even, size, SPLAT_SAMPLES)
     finally:
         bpy.data.cameras.remove(view[0])
     error = float(((truth - asset) ** 2).mean())
@@ -147,7 +148,7 @@ class TIMESPLAT_OT_compare(bpy.types.Operator):
     bl_options = {"REGISTER"}  # noqa: RUF012
 
     size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=256, min=16)
-    samples: IntProperty(name="Samples", description="Cycles samples a pixel", default=8, min=1)
+    samples: IntProperty(name="Samples", description="Cycles samples a pixel of the original", default=16, min=1)
 
     poll = edit.TIMESPLAT_OT_delete.poll
 
