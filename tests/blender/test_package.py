@@ -62,12 +62,12 @@ TRACES = """
 def traces():
     "all places of Blender's where an add-on may leave something"
     handlers, timers = bpy.app.handlers, bpy.app.timers
-    found = {n: [f.__module__ for f in getattr(handlers, n)] for n in dir(handlers)
+    found = {n: sorted(f.__module__ for f in getattr(handlers, n)) for n in dir(handlers)
              if isinstance(getattr(handlers, n), list)}
     for t in dir(bpy.types):
         cls = getattr(bpy.types, t)
         draws = getattr(getattr(cls, "draw", None), "_draw_funcs", None)
-        found["draw " + t] = [f.__module__ for f in draws or [] if not f.__module__.startswith("bl_")]
+        found["draw " + t] = sorted(f.__module__ for f in draws or [] if f.__module__[:6] != "bl_ui.")
         if t in ("Scene", "Object", "WindowManager", "Collection", "Mesh", "PointCloud", "Camera", "Material",
                  "Action", "Text", "Image", "NodeTree", "NodesModifier", "World", "ID", "Screen", "WorkSpace"):
             found["properties " + t] = sorted(cls.bl_rna.properties.keys()) + sorted(dir(cls))
