@@ -35,7 +35,7 @@ MENUS = {"Look": LOOKS, "Repeat": REPEATS}
 SLIDERS = {  # name: (panel in the modifier, kind of socket, default, lowest, highest, description)
     "Look": ("", "Menu", "Automatic", None, None, "Automatic is Points in the viewport and Splats in renders"),
     "Opacity Cut": ("", "Float", VISIBLE, 0, 1, "Gaussians fainter than this at a moment are left out"),
-    "Point Size": ("", "Float", 1.0, 0, 100, "Size of the dots of the look Points"),
+    "Point Size": ("", "Float", 1.5, 0, 100, "Radius of the dots of the look Points, in standard deviations"),
     "Density": ("", "Float", 1.0, 0, 1, "Share of the Gaussians that is shown"),
     "Frame Start": ("Time", "Float", 0.0, -1e6, 1e6, "Scene frame at which the clip starts"),
     "Frame End": ("Time", "Float", 23.0, -1e6, 1e6, "Scene frame at which the clip ends"),

@@ -69,7 +69,7 @@ def test_evaluated_attributes_are_those_of_numpy(blender, tmp_path):
         np.testing.assert_allclose(got["gs_alpha"], opacity[seen], atol=1e-5)
         np.testing.assert_allclose(np.array(got["gs_color"])[:, :3], linear_from_srgb(asset.rgb)[seen], atol=1e-6)
         s = np.sort(asset.soft_scale()[seen], 1)
-        np.testing.assert_allclose(got["radius"], s[:, 1] if look == "Points" else 3 * s[:, 2], rtol=1e-5)
+        np.testing.assert_allclose(got["radius"], 1.5 * s[:, 1] if look == "Points" else 3 * s[:, 2], rtol=1e-5)
         np.testing.assert_allclose(got["world"], position[seen][:5] * 2.5 + [1, -2, 3], atol=2e-5)
         assert got["material"].endswith(look)
 
