@@ -305,7 +305,7 @@ def draw(layout) -> None:
         box = layout.column(align=True)
         row = box.row(align=True)
         if job.state == "running":
-            row.progress(factor=job.fraction, text=f"{job.label}: {job.text}")
+            row.progress(factor=job.fraction, text=job.text)
         else:
             row.label(text=f"{job.label}: {job.message or job.text}", icon=ICONS[job.state])
         if job.state == "waiting":
