@@ -25,8 +25,8 @@ EXTENSION = "bl_ext.user_default.timesplat"
 HEAD = """
 import atexit, importlib, importlib.util, json, os, sys
 import bpy, numpy as np
-if bpy.app.version < (4, 5) and not bpy.app.binary_path:
-    atexit.register(os._exit, 0)  # last of all: that wheel crashes on its way out where a panel is registered
+if bpy.app.version < (5, 0) and not bpy.app.binary_path:
+    atexit.register(os._exit, 0)  # last of all: these wheels crash or hang on their way out where a panel is registered
 if "--" in sys.argv:  # Blender's own arguments stand before it
     sys.argv[1:] = sys.argv[sys.argv.index("--") + 1:]
 def tell(**d): print("RESULT" + json.dumps(d), flush=True)
