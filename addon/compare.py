@@ -1,114 +1,137 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Original, reconstruction and their difference side by side, at the frame that is shown: `timesplat.compare`.
 
-Both are rendered by Cycles, small, in a throw-away copy of the scene, as the capture rendered what the asset was made
-from: with Even Light where that was on, over white, colours as they are. The picture is the image "Timesplat Compare".
+Both are rendered by Cycles, small, in a Blender of their own (`beside`), as the capture rendered what the asset was
+made from: with Even Light where that was on, over white, colours as they are. The picture is the image
+"Timesplat Compare".
 """
 
 from __future__ import annotations
 
 import math
-import tempfile
 from pathlib import Path
 
 import bpy
 import numpy as np
 from bpy.props import IntProperty
+from mathutils import Matrix
 
 from ..datagen import capture
 from ..datagen.scene import borrowed, shown_objects
 from ..datagen.sequence import InputError
-from . import display, edit
+from . import beside, display, edit, jobs
 
 IMAGE = "Timesplat Compare"
 SPLAT_SAMPLES = 2  # splats are smooth and glow by themselves: more samples change next to nothing
 GAIN = 4  # the difference is shown this many times as strong
 
 
-def compare(ob, context=None, *, size: int = 256, samples: int = 16) -> tuple[np.ndarray, float]:
-    """(height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made from, the asset, GAIN
-    times their absolute difference; and the PSNR in dB over the whole picture. The view is the scene's camera's, or
-    without one the 3D view's; `size` pixels is its longer side, `samples` are the original's. What the asset was made
-    from are the objects that `timesplat_source` names, else all that renders show but assets. Raises InputError where
-    there is no view or nothing to compare with."""
-    context = context or bpy.context
+def start(ob, context, size: int, samples: int) -> jobs.Job:
+    """Starts the comparison as a Job; its end shows the picture. The view is the scene's camera's, or without one the
+    3D view's; `size` pixels is its longer side, `samples` are the original's. What the asset was made from are the
+    objects that `timesplat_source` names, else all that renders show but assets. Raises InputError where there is no
+    view or nothing to compare with."""
     scene = context.scene
     if not hasattr(scene, "cycles"):
         raise InputError("Cycles, which renders the comparison, is switched off; enable it in the preferences.")
     names = ob.get("timesplat_source")
-    if names is not None:
-        originals = [scene.objects[name] for name in names if name in scene.objects]
-    else:
-        originals = shown_objects(scene, context.view_layer)
+    shown = shown_objects(scene, context.view_layer)
+    originals = shown if names is None else [scene.objects[name] for name in names if name in scene.objects]
     originals = [o for o in originals if o.type not in ("CAMERA", "LIGHT") and not o.get("timesplat")]
     if not originals:
         raise InputError(f"{ob.name}: what it was made from is not in this scene; open the scene that has it.")
-    lights = [o for o in shown_objects(scene, context.view_layer) if o.type == "LIGHT"]
-    even = bool(ob.get("timesplat_lighting", True))
-    view = _camera(context)
-    try:
-        truth = _picture(context, [*originals, *lights], view, even, size, samples)
-        asset = _picture(context, [ob], view, even, size, SPLAT_SAMPLES)
-    finally:
-        bpy.data.cameras.remove(view[0])
-    error = float(((truth - asset) ** 2).mean())
-    psnr = -10 * math.log10(error) if error else math.inf
-    return np.concatenate([truth, asset, np.minimum(GAIN * np.abs(truth - asset), 1)], 1), psnr
+    request = {
+        "asset": ob.name,
+        "originals": [o.name for o in originals],
+        "lights": [o.name for o in shown if o.type == "LIGHT"],
+        "even": bool(ob.get("timesplat_lighting", True)),
+        "view": None if scene.camera and scene.camera.type == "CAMERA" else _view(context),
+        "size": size,
+        "samples": samples,
+    }
+
+    def finish(event: dict, folder: Path) -> str:
+        show(to_image(np.load(folder / "compared.npy")), bpy.context)
+        return f"Original, reconstruction, {GAIN} times the difference: {event['psnr']:.1f} dB PSNR."
+
+    return jobs.start("Compare", [lambda folder: beside.start("addon.compare", request, folder)], finish)
 
 
-def _camera(context) -> tuple:
-    """(a camera, its matrix in the world, width, height in any unit); the camera is to be removed by the caller."""
-    scene, render = context.scene, context.scene.render
-    if scene.camera and scene.camera.type == "CAMERA":
-        data, matrix = scene.camera.data.copy(), scene.camera.matrix_world.copy()
-        return data, matrix, render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
+def _view(context) -> dict:
+    """The 3D view as a camera: settings of its data, matrix in the world, width and height."""
     for area in context.screen.areas if context.screen and not bpy.app.background else ():
         if area.type != "VIEW_3D":
             continue
         space, region = area.spaces.active, next(r for r in area.regions if r.type == "WINDOW")
-        data = bpy.data.cameras.new("timesplat")
-        data.sensor_fit, data.sensor_width, data.lens = "AUTO", 72, space.lens  # the 3D view's sensor
-        data.clip_start, data.clip_end = space.clip_start, space.clip_end
+        data = {"sensor_width": 72, "lens": space.lens}  # the 3D view's sensor
+        data |= {"clip_start": space.clip_start, "clip_end": space.clip_end}
         if space.region_3d.view_perspective == "ORTHO":
-            data.type, data.ortho_scale = "ORTHO", space.region_3d.view_distance * 72 / space.lens
-        return data, space.region_3d.view_matrix.inverted(), region.width, region.height
-    raise InputError(f"{scene.name}: there is no camera and no 3D view to look through; add a camera.")
+            data |= {"type": "ORTHO", "ortho_scale": space.region_3d.view_distance * 72 / space.lens}
+        matrix = [list(row) for row in space.region_3d.view_matrix.inverted()]
+        return {"data": data, "matrix": matrix, "width": region.width, "height": region.height}
+    raise InputError(f"{context.scene.name}: there is no camera and no 3D view to look through; add a camera.")
 
 
-def _picture(context, objects: list, view: tuple, even: bool, size: int, samples: int) -> np.ndarray:
+# ---------------------------------------------------------------- in the Blender beside
+
+
+def compare(request: dict, progress) -> dict:
+    """Writes compared.npy, (height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made
+    from, the asset, GAIN times their absolute difference; returns the PSNR in dB over the whole picture."""
+    scene = bpy.context.scene
+    named = {key: [scene.objects[n] for n in request[key]] for key in ("originals", "lights")}
+    view = _camera(scene, request["view"])
+    progress(0.1, "rendering the original")
+    truth = _picture(scene, [*named["originals"], *named["lights"]], view, request, request["samples"])
+    progress(0.6, "rendering the reconstruction")
+    asset = _picture(scene, [scene.objects[request["asset"]]], view, request, SPLAT_SAMPLES)
+    np.save("compared.npy", np.concatenate([truth, asset, np.minimum(GAIN * np.abs(truth - asset), 1)], 1))
+    error = float(((truth - asset) ** 2).mean())
+    return {"psnr": min(-10 * math.log10(max(error, 1e-12)), 120.0)}
+
+
+def _camera(scene, view: dict | None) -> tuple:
+    """(camera, its matrix in the world, width, height in any unit)."""
+    if not view:
+        render = scene.render
+        data, matrix = scene.camera.data, scene.camera.matrix_world.copy()
+        return data, matrix, render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
+    data = bpy.data.cameras.new("timesplat")
+    for key, value in view["data"].items():
+        setattr(data, key, value)
+    return data, Matrix(view["matrix"]), view["width"], view["height"]
+
+
+def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> np.ndarray:
     """(H,W,3) float32, sRGB-encoded, over white: the objects, shown whether or not they are hidden."""
     data, matrix, width, height = view
-    scale = size / max(width, height)
+    scale = request["size"] / max(width, height)
     width, height = max(1, round(width * scale)), max(1, round(height * scale))
-    scene = context.scene
-    with tempfile.TemporaryDirectory() as tmp, capture._temporary() as made:
-        shown = []
-        for ob in objects:
-            if ob.get("timesplat") or ob.hide_render:
-                ob = ob.copy()
-                made.append(ob)
-                ob.hide_render = False
-                if modifier := display.sampler(ob):
-                    display.set_input(modifier, "Look", "Splats")
-            shown.append(ob)
-        with borrowed(shown, lights=not even) as stage:
-            capture._settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
-            if even:
-                capture._lights(stage, made)
-            stage.render.use_multiview = False
-            stage.cycles.transparent_max_bounces = display.TRANSPARENT_BOUNCES
-            stage.cycles.min_transparent_bounces = display.TRANSPARENT_BOUNCES  # no roulette: less noise
-            camera = bpy.data.objects.new("timesplat", data)
-            made.append(camera)
-            camera.matrix_world = matrix
-            stage.collection.objects.link(camera)
-            stage.camera = camera
-            stage.frame_set(scene.frame_current, subframe=scene.frame_subframe)
-            stage.render.filepath = str(Path(tmp) / "frame")
-            with bpy.context.temp_override(scene=stage):
-                bpy.ops.render.render(write_still=True)
-            rgba = capture.straight_srgb(capture.read_multilayer(Path(tmp) / "frame.exr")["combined"]) / np.float32(255)
+    for ob in objects:
+        ob.hide_render = False
+        if modifier := display.sampler(ob):
+            display.set_input(modifier, "Look", "Splats")
+    with borrowed(objects, lights=not request["even"]) as stage, capture._temporary() as made:
+        capture._settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
+        if request["even"]:
+            capture._lights(stage, made)
+        stage.render.use_multiview = False
+        stage.cycles.transparent_max_bounces = display.TRANSPARENT_BOUNCES
+        stage.cycles.min_transparent_bounces = display.TRANSPARENT_BOUNCES  # no roulette: less noise
+        camera = bpy.data.objects.new("timesplat", data)
+        made.append(camera)
+        camera.matrix_world = matrix
+        stage.collection.objects.link(camera)
+        stage.camera = camera
+        stage.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+        stage.render.filepath = str(Path.cwd() / "frame")
+        with bpy.context.temp_override(scene=stage):
+            bpy.ops.render.render(write_still=True)
+    rgba = capture.straight_srgb(capture.read_multilayer(Path("frame.exr"))["combined"]) / np.float32(255)
     return rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+
+
+# ---------------------------------------------------------------- in the artist's Blender
 
 
 def to_image(pixels: np.ndarray):
@@ -145,21 +168,28 @@ class TIMESPLAT_OT_compare(bpy.types.Operator):
 
     bl_idname = "timesplat.compare"
     bl_label = "Compare"
-    bl_options = {"REGISTER"}  # noqa: RUF012
 
     size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=256, min=16)
     samples: IntProperty(name="Samples", description="Cycles samples a pixel of the original", default=16, min=1)
 
     poll = edit.TIMESPLAT_OT_delete.poll
 
-    def execute(self, context):
+    def invoke(self, context, event):
         try:
-            pixels, psnr = compare(context.object, context, size=self.size, samples=self.samples)
+            start(context.object, context, self.size, self.samples)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
-        show(to_image(pixels), context)
-        self.report({"INFO"}, f"Original, reconstruction, {GAIN} times the difference: {psnr:.1f} dB PSNR.")
+        return {"FINISHED"}
+
+    def execute(self, context):
+        try:
+            job = start(context.object, context, self.size, self.samples)
+            jobs.wait(job)
+        except InputError as e:
+            self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        self.report({"INFO"}, job.message)
         return {"FINISHED"}
 
 
@@ -169,3 +199,7 @@ def register() -> None:
 
 def unregister() -> None:
     bpy.utils.unregister_class(TIMESPLAT_OT_compare)
+
+
+if __name__ == "__main__":
+    beside.serve(compare)

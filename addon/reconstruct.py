@@ -59,17 +59,14 @@ class TIMESPLAT_OT_reconstruct(settings.Settings, bpy.types.Operator):
 
 def request(chosen, context) -> dict:
     """What these settings ask of `capture`, but for the folder to write. Raises InputError."""
-    scene = context.scene
     cameras, _ = settings.cameras(context)
     for ob in cameras:
         if ob.data.type != "PERSP":
             raise InputError(f"{ob.name}: the camera is not a perspective one; change its type or unselect it.")
     return {
-        "scene": scene.name,
-        "layer": context.view_layer.name,
         "objects": [o.name for o in settings.objects(chosen, context)],
         "cameras": [o.name for o in cameras],
-        "frames": list(settings.frames(chosen, scene)),
+        "frames": list(settings.frames(chosen, context.scene)),
         "in_turn": chosen.in_turn,
         "size": chosen.size,
         "samples": chosen.samples,
@@ -130,7 +127,7 @@ def start(chosen, context) -> jobs.Job:
 
     shares = [expected.rendering, expected.reconstructing]
     return jobs.start(
-        "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=shot["scene"]
+        "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=context.scene.name
     )
 
 

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A Blender beside Blender: a process without a window that opens a copy of the artist's file and does one thing.
+
+So rendering never blocks the artist's Blender, nothing of the open scene can change, to cancel is to end a process, and
+a crash is a sentence. `start` belongs to the add-on; a module that runs beside ends with `serve(do)`, and speaks as
+`process` says.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+import bpy
+
+from ..datagen.sequence import InputError
+from . import process
+
+
+def start(module: str, request: dict, folder: Path) -> process.Child:
+    """Saves a copy of the open file into the folder (nothing of the session changes, not its name either) and starts
+    `timesplat.<module>` on it, with the open scene and view layer. Raises InputError where the copy cannot be
+    written."""
+    blend = folder / "scene.blend"
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend), copy=True, compress=False, relative_remap=True)
+    except RuntimeError as e:
+        full = shutil.disk_usage(folder).free < 1 << 20  # Blender says "no such file" then
+        why = "no space is left on the disk; make room there" if full else " ".join(str(e).split())
+        raise InputError(f"{blend}: the copy to render from cannot be written: {why}.") from None
+    request = request | {
+        "blend": str(blend),
+        "name": Path(bpy.data.filepath).name,
+        "scripts": not bpy.app.autoexec_fail,  # whether those in the file may run: as here
+        "scene": bpy.context.scene.name,
+        "layer": bpy.context.view_layer.name,
+    }
+    code = process.launch(module)
+    program = bpy.app.binary_path  # empty where Blender is a Python module
+    command = [program, "-b", "--factory-startup", "--python-exit-code", "1", "--python-expr", code]
+    return process.Child(command if program else [sys.executable, "-c", code], request, folder)
+
+
+def serve(do: Callable[[dict, Callable], dict]) -> NoReturn:
+    """Answers the one request on standard input and ends the process: opens the file, calls `do(request, progress)`,
+    whose dict goes into the "done" event; `progress(fraction, text)`."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what Blender prints is log
+
+    def say(event: str, **values) -> None:
+        print(json.dumps({"event": event, **values}), file=answers, flush=True)
+
+    def progress(fraction: float, text: str) -> None:
+        say("progress", fraction=fraction, text=text)
+
+    request = json.loads(sys.stdin.readline())
+    threading.Thread(target=_leave_when_stdin_closes, daemon=True).start()
+    code = 1
+    try:
+        progress(0.0, "opening the scene")
+        bpy.ops.wm.open_mainfile(filepath=request["blend"], load_ui=False, use_scripts=request["scripts"])
+        window, scene = bpy.context.window, bpy.data.scenes[request["scene"]]
+        window.scene = scene
+        window.view_layer = scene.view_layers[request["layer"]]
+        say("done", **do(request, progress))
+        code = 0
+    except InputError as e:
+        say("error", message=str(e))
+    except MemoryError:
+        say("error", message="Rendering ran out of memory; choose fewer pixels or cameras.")
+    except Exception as e:
+        traceback.print_exc()
+        say("error", message=f"Rendering stopped with {type(e).__name__}: {' '.join(str(e).split())[:300]}")
+    sys.stderr.flush()
+    os._exit(code)  # Blender's own way out is slow
+
+
+def _leave_when_stdin_closes() -> None:
+    while sys.stdin.readline():
+        pass
+    os._exit(3)
