@@ -183,8 +183,8 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
     try:
         for other in [x for x in stage.view_layers if x.name != layer.name]:
             stage.view_layers.remove(other)
-        for child in list(stage.collection.children):
-            stage.collection.children.unlink(child)
+        for child in stage.view_layers[0].layer_collection.children:
+            child.exclude = True  # to unlink them has crashed Blender 5.2 while a 3D view was rendering
         for ob in list(stage.collection.objects):
             stage.collection.objects.unlink(ob)
         for ob in keep:
