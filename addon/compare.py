@@ -169,7 +169,7 @@ class TIMESPLAT_OT_compare(bpy.types.Operator):
     bl_idname = "timesplat.compare"
     bl_label = "Compare"
 
-    size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=256, min=16)
+    size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=384, min=16)
     samples: IntProperty(name="Samples", description="Cycles samples a pixel of the original", default=16, min=1)
 
     poll = edit.TIMESPLAT_OT_delete.poll

@@ -83,7 +83,7 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row = col.row(align=True)
             row.label(text=f"{expected.pictures} pictures", icon="RENDER_RESULT")
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
-            about = "about" if chosen.budget == "ALL" else "at most"
+            about = "at most" if chosen.budget == "NUMBER" else "about"
             col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
         row = layout.row()
         row.scale_y = 1.5
