@@ -307,7 +307,8 @@ def draw(layout) -> None:
         if job.state == "running":
             row.progress(factor=job.fraction, text=job.text)
         else:
-            row.label(text=f"{job.label}: {job.message or job.text}", icon=ICONS[job.state])
+            said = job.message if job.state == "done" else f"{job.label}: {job.message or job.text}"
+            row.label(text=said, icon=ICONS[job.state])
         if job.state == "waiting":
             row.operator("timesplat.bring", text="", icon="IMPORT").number = job.number
         row.operator("timesplat.log", text="", icon="TEXT").number = job.number

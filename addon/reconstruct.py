@@ -112,6 +112,8 @@ def start(chosen, context) -> jobs.Job:
         # the Sequence counts frames from 0; in this scene the clip lies where it was taken from
         asset = read_ply(folder / "asset.ply")
         asset.clip = replace(asset.clip, frame_start=frames[0], frame_end=frames[-1])
+        if not (asked["budget"] or asked["refine"]):
+            settings.learn_number(asked["method"], len(asset), pixels)
         ob = display.add_asset(asset, "Timesplat", look=look, context=bpy.context)
         ob["timesplat_source"], ob["timesplat_lighting"] = names, shot["lighting"]
         roots = {n: o for n in names if (o := bpy.context.scene.objects.get(n)) and not o.parent}

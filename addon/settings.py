@@ -151,7 +151,8 @@ def budget(settings) -> str | None:
 
 # ---------------------------------------------------------------- how long it takes
 
-FILL = {"guided": 0.19, "lift": 0.19, "rgb": 0.11}  # Gaussians a pixel of the pictures: measured, mean of 12 objects
+# Gaussians a pixel of the pictures: the mean of 12 objects, until one was made here
+_fill = {"guided": 0.19, "lift": 0.19, "rgb": 0.11}
 START, FITTING = 3.0, 5.0  # seconds: a process's start; a budget's own fit of pictures of PIXELS
 PIXELS = 128**2
 FITTED = 4000  # Gaussians that a fit of pictures of PIXELS uses at most, and in proportion to their sides
@@ -175,7 +176,7 @@ def estimate(settings, context) -> Estimate:
     placed, _ = cameras(context)
     n *= 1 if settings.in_turn or not placed else len(placed)
     pixels = n * settings.size**2
-    predicted = FILL[settings.method] * pixels
+    predicted = _fill[settings.method] * pixels
     fit = settings.refine or (FITTING * max(settings.size**2 / PIXELS, 1) if settings.budget != "ALL" else 0)
     most = FITTED * settings.size / PIXELS**0.5 if fit else predicted
     kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
@@ -188,6 +189,11 @@ def learn(seconds: float, pixels: int, samples: int) -> None:
     """Remembers, for this session, how fast this machine captures."""
     global _rate
     _rate = max(seconds - START, 0.1) / max(pixels * samples, 1)
+
+
+def learn_number(method: str, gaussians: int, pixels: int) -> None:
+    """Remembers, for this session, how many Gaussians were predicted from so many pixels."""
+    _fill[method] = gaussians / max(pixels, 1)
 
 
 def register() -> None:

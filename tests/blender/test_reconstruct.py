@@ -182,6 +182,9 @@ for budget, refine, size in (("ALL", 0, 128), ("SHARE", 0, 128), ("SHARE", 0, 32
     chosen.budget, chosen.refine, chosen.size, chosen.number = budget, refine, size, 100
     e = settings.estimate(chosen, bpy.context)
     counts[f"{budget} {refine} {size}"] = [e.gaussians, e.reconstructing]
+settings.learn_number("guided", 9000, 10_000)
+chosen.budget, chosen.refine, chosen.size = "ALL", 0, 128
+counts["learnt"] = settings.estimate(chosen, bpy.context).gaussians
 tell(counts=counts, ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
      estimates=estimates)
 """
@@ -206,5 +209,6 @@ def test_what_the_settings_select(blender):
     counts = told["counts"]  # five pictures
     assert counts["ALL 0 128"][0] == round(0.19 * 5 * 128**2) and counts["SHARE 0 128"][0] == round(0.019 * 5 * 128**2)
     assert counts["SHARE 0 32"][0] == round(0.019 * 5 * 32**2) and counts["NUMBER 0 128"][0] == 100
+    assert counts["learnt"] == round(0.9 * 5 * 128**2)
     assert counts["ALL 9 256"][0] == 2 * NEAR_FEW
     assert counts["SHARE 0 128"][1] - counts["ALL 0 128"][1] == pytest.approx(5)
