@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from timesplat.model.asset import read_ply
+from timesplat.model.asset import Clip, read_ply, write_ply
 from timesplat.model.usd import check_usd
 
-from .helpers import REAL, TARGET
+from .helpers import REAL, TARGET, make
 from .window import Window, missing
 
 pytestmark = [
@@ -252,3 +252,67 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
             w.key("d")  # Don't Save
         assert w.process.wait(60) == 0, w.said()
     nothing_left(w)
+
+
+ASSET = """
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+scene = bpy.context.scene
+bpy.ops.timesplat.import_asset(filepath=sys.argv[2])
+bpy.context.object["timesplat_source"] = ["Suzanne"]
+scene.frame_set(6)
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+tell()
+"""
+COUNT = "len(getattr(bpy.context.object.data, 'points', None) or bpy.context.object.data.vertices)"
+
+
+def test_the_buttons_below_a_result(window, installed, tmp_path):
+    """Delete in a rectangle that is dragged, undo, bake, compare."""
+    asset = make(400, clip=Clip(24, 1, 12))
+    asset.sigma_t[:] = 10
+    write_ply(tmp_path / "a.ply", asset)
+    installed(ASSET, tmp_path / "monkey.blend", tmp_path / "a.ply")
+    with window(tmp_path / "monkey.blend", TIMESPLAT_PYTHON=sys.executable) as w:
+        side = w.sidebar()
+        view = w.area("VIEW_3D")
+        assert w.ask(COUNT) == 400
+
+        def scrolled(operator: str) -> None:
+            w.move(side["x"] + 100, side["y"] + 500)
+            time.sleep(0.7)
+            w.wheel(-15)
+            w.press(operator, top=300)
+
+        w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
+        time.sleep(0.7)
+        w.key("shift+h", "Home")  # the result alone, filling the view
+        scrolled("timesplat.delete_rectangle")
+        middle = view["x"] + view["w"] / 2, view["y"] + view["h"] / 2
+        w.drag(middle[0], middle[1] - 300, middle[0] - 500, middle[1] + 350)
+        w.wait_for(f"{COUNT} < 400")
+        left = w.ask(COUNT)
+        assert 40 < left < 360
+        w.picture("deleted")
+        w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
+        time.sleep(0.7)
+        w.key("ctrl+z")
+        w.wait_for(f"{COUNT} == 400")
+        w.key("ctrl+shift+z")
+        w.wait_for(f"{COUNT} == {left}")
+
+        scrolled("timesplat.bake")
+        w.move(w.place[0], w.place[1] - 40)  # from the dialog's first field to its title
+        time.sleep(0.7)
+        w.key("Return")
+        w.wait_for("sum('timesplat' in o for o in bpy.data.objects) == 2")
+        assert w.ask(COUNT) <= left
+        w.picture("baked")
+
+        scrolled("timesplat.compare")
+        w.wait_for(f"{JOBS} and {JOBS}[-1][0] not in ('running', 'waiting')", 120)
+        assert w.ask(JOBS)[-1][0] == "done" and "PSNR" in w.ask(JOBS)[-1][3], w.ask(JOBS)
+        w.wait_for("any(a['kind'] == 'IMAGE_EDITOR' for x in look() for a in x['areas'])")
+        time.sleep(2)
+        w.picture("compared")
+        assert w.ask("list(bpy.data.images['Timesplat Compare'].size)")[0] == 3 * 384
+    assert list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*")) == []
