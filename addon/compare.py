@@ -111,10 +111,10 @@ def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> 
         ob.hide_render = False
         if modifier := display.sampler(ob):
             display.set_input(modifier, "Look", "Splats")
-    with borrowed(objects, lights=not request["even"]) as stage, capture._temporary() as made:
-        capture._settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
+    with borrowed(objects, lights=not request["even"]) as stage, capture.temporary() as made:
+        capture.render_settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
         if request["even"]:
-            capture._lights(stage, made)
+            capture.even_light(stage, made)
         stage.render.use_multiview = False
         stage.cycles.transparent_max_bounces = display.TRANSPARENT_BOUNCES
         stage.cycles.min_transparent_bounces = display.TRANSPARENT_BOUNCES  # no roulette: less noise

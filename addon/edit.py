@@ -15,8 +15,6 @@ from ..datagen.sequence import InputError
 from . import display, nodes
 from .held import applied, asset_of, in_box, peak, shown, sliders
 
-__all__ = ["applied", "asset_of", "baked", "keep"]
-
 # ---------------------------------------------------------------- throwing away
 
 _KINDS = {  # of attributes: numbers in a value, key, dtype

@@ -21,7 +21,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from ..datagen.sequence import InputError
 from ..model import slices, usd
 from ..model.asset import Asset, atomic, write_ply
-from . import display, edit, preferences, process
+from . import display, held, preferences, process
 from .importer import busy
 
 REPORT = "Timesplat USD report"
@@ -46,7 +46,7 @@ MODE_ITEMS = [
 def present(ob, apply_sliders: bool) -> Asset:
     """The asset as the object shows it now, with its place in the world in the clip (see `slices.placed`).
     Raises InputError."""
-    asset = edit.applied(ob) if apply_sliders else edit.asset_of(ob)
+    asset = held.applied(ob) if apply_sliders else held.asset_of(ob)
     bpy.context.view_layer.update()  # a script may have moved it just now
     matrix, clip = np.array(ob.matrix_world), asset.clip
     own = np.diag([clip.scale, clip.scale, clip.scale, 1.0])

@@ -32,7 +32,7 @@ KEPT = 8  # Jobs that are listed; older ones that have ended are forgotten
 JOBS: list[Job] = []
 _numbers = itertools.count(1)
 _session = 0  # counts the files that were opened
-ICONS = {"running": "SORTTIME", "waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
+ICONS = {"waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
 
 
 class Job:

@@ -108,10 +108,10 @@ def capture(
         with contextlib.ExitStack() as stack:
             tmp = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             stage = stack.enter_context(borrowed(objects, lights=not lighting))
-            made = stack.enter_context(_temporary())
-            _settings(stage, width, height, samples, passes, engine, device, threads)
+            made = stack.enter_context(temporary())
+            render_settings(stage, width, height, samples, passes, engine, device, threads)
             if lighting:
-                _lights(stage, made)
+                even_light(stage, made)
             cameras = _Cameras(stage, made, normalisation)
             done = 0
             for frame, group in groupby(order, key=lambda i: shots[i].frame):
@@ -195,7 +195,7 @@ def _plain(text: str) -> str:
 
 
 @contextlib.contextmanager
-def _temporary() -> Iterator[list]:
+def temporary() -> Iterator[list]:
     """A list of data-blocks that are removed at the end."""
     made: list = []
     try:
@@ -204,7 +204,8 @@ def _temporary() -> Iterator[list]:
         bpy.data.batch_remove(made)
 
 
-def _settings(stage, width, height, samples, passes, engine, device, threads) -> None:
+def render_settings(stage, width, height, samples, passes, engine, device, threads) -> None:
+    """Makes the borrowed scene render as `capture` says, into multi-layer EXR, whatever was set before."""
     render, layer = stage.render, stage.view_layers[0]
     render.engine = engine
     render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
@@ -236,7 +237,7 @@ def _settings(stage, width, height, samples, passes, engine, device, threads) ->
     render.views_format = "MULTIVIEW"
 
 
-def _lights(stage, made: list) -> None:
+def even_light(stage, made: list) -> None:
     """Three suns and a grey world: the same for every object, wherever it lies and however large it is."""
     world = bpy.data.worlds.new("timesplat")
     made.append(world)
