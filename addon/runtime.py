@@ -16,6 +16,7 @@ comes from PyTorch's index for the build (https://pytorch.org/get-started), the 
 from __future__ import annotations
 
 import contextlib
+import glob
 import importlib.util
 import json
 import os
@@ -202,10 +203,20 @@ def _install(command: list[str], venv: Path, work: Path, build: str, progress) -
                 count = min(len(list(site.glob("*.dist-info"))) - before, total)
                 progress(0.7 + 0.3 * count / total, f"installing: {count} of {total} packages")
             else:
-                got = sum(f.stat().st_size for f in work.glob("pip-*/*.whl"))
+                got = _fetched(work)
                 progress(min(0.7 * got / DOWNLOAD[build], 0.69), f"fetching {loading} ({got / 1e6:.0f} MB so far)")
     if _child.returncode:
         raise Stop(_why(lines, work))
+
+
+def _fetched(work: Path) -> int:
+    """Bytes of the wheels in pip's temporary folders. pip removes such folders at any moment: what goes while it is
+    counted counts nothing (`glob` passes over it, which `Path.glob` does not)."""
+    total = 0
+    for wheel in glob.iglob(f"{glob.escape(str(work))}/pip-*/*.whl"):
+        with contextlib.suppress(OSError):
+            total += os.path.getsize(wheel)
+    return total
 
 
 _child: subprocess.Popen | None = None

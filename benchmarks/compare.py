@@ -296,11 +296,11 @@ def read_log(folder: Path) -> list[dict]:
 
 def held_out(folder: Path, by: int, limit: int | None) -> list[tuple]:
     """[(input views with passes, target views)] of the Sequences below a folder, shrunk."""
-    from timesplat.datagen.sequence import read_sequence
+    from timesplat.datagen.sequence import read_sequence, sequences_in
     from timesplat.model.data import shrink
     from timesplat.model.views import load_views
 
-    found = sorted(p.parent for p in folder.rglob("transforms.json"))[:limit]
+    found = sequences_in(folder)[:limit]
     if not found:
         raise InputError(f"{folder}: no Sequence in it; render some with `timesplat render`.")
     pairs = []

@@ -26,7 +26,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from timesplat.datagen.sequence import read_sequence
+from timesplat.datagen.sequence import read_sequence, sequences_in
 from timesplat.model.evaluate import draw
 from timesplat.model.metrics import psnr
 from timesplat.model.network import PRESETS, Network
@@ -126,10 +126,10 @@ def row(name: str, views: Views, drop: bool, device: str, roof: float, seconds: 
 
 def objects(folders: list[Path]):
     """Name, input Views and held-out Views of every Sequence below the folders."""
-    for file in sorted(f for folder in folders for f in folder.rglob("transforms.json")):
-        seq = read_sequence(file.parent)
+    for found in [f for folder in folders for f in sequences_in(folder)]:
+        seq = read_sequence(found)
         inputs = load_views(seq, seq.select(rig="alternating"), passes=True)
-        yield file.parent.parent.name, inputs, load_views(seq, seq.select(rig="target"))
+        yield found.parent.name, inputs, load_views(seq, seq.select(rig="target"))
 
 
 def measure(run, targets: Views) -> tuple[float, float]:

@@ -14,7 +14,7 @@ import torch
 
 from timesplat.benchmarks.figures import replace as write
 from timesplat.datagen.rigs import CANONICAL
-from timesplat.datagen.sequence import InputError, Sequence, read_sequence
+from timesplat.datagen.sequence import InputError, Sequence, read_sequence, sequences_in
 from timesplat.model import protocol
 from timesplat.model.evaluate import Truth, evaluate_views, load_inputs, load_truth, parse_method
 from timesplat.model.lpips import LPIPS
@@ -99,7 +99,7 @@ def _truth(root: str, targets: tuple[int, ...], novel: tuple[int, ...], size: in
 
 def subjects(folders: list[Path], size: int) -> list[Subject]:
     """Every Sequence below the folders, named by object (and clip where an object has several)."""
-    found = sorted({p.parent for f in folders for p in Path(f).rglob("transforms.json")})
+    found = sorted({p for f in folders for p in sequences_in(f)})
     if not found:
         raise InputError(f"{folders[0]}: no Sequence in it; {RENDER}.")
     objects = [f.parent.name for f in found]

@@ -279,6 +279,17 @@ def _to_json(seq: Sequence) -> dict:
     }
 
 
+def sequences_in(root: Path) -> list[Path]:
+    """The folders of finished Sequences at any depth of `root`, itself included, sorted. Hidden folders are left out:
+    a Sequence is rendered in one and renamed when it is whole, perhaps at this moment."""
+    found = []
+    for folder, below, files in os.walk(root):
+        below[:] = [name for name in below if not name.startswith(".")]
+        if "transforms.json" in files:
+            found.append(Path(folder))
+    return sorted(found)
+
+
 def read_sequence(folder: Path) -> Sequence:
     """Reads and checks `folder/transforms.json`; images are read later, but that they exist is checked now.
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..datagen.rigs import CANONICAL
-from ..datagen.sequence import InputError, read_sequence
+from ..datagen.sequence import InputError, read_sequence, sequences_in
 from .sampling import Layout, choose
 from .views import Views
 
@@ -144,7 +144,7 @@ class Clips:
         the mix would draw."""
         self.shrink, self.sampling, self.passes = shrink, sampling, passes
         weights = parse_mix(mix)
-        found = [p.parent for f in folders for p in sorted(Path(f).rglob("transforms.json"))]
+        found = [p for f in folders for p in sequences_in(f)]
         if not found:
             raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
         self.paths = [pack(f, cache) for f in tqdm(found, desc="packing", unit="clip", leave=False, disable=None)]

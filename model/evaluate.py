@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
-from ..datagen.sequence import InputError, Sequence, read_sequence
+from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
 from . import protocol
 from .budget import parse as parse_budget
 from .data import shrink
@@ -343,9 +343,7 @@ def find_sequences(assets: list[str]) -> tuple[dict[str, Sequence], list[str]]:
     clip's where an object has several), and those that hold none and are to be rendered."""
     folders, others = [], []
     for asset in assets:
-        root = Path(asset)
-        found = [p.parent for p in sorted(root.rglob("transforms.json")) if root.is_dir()]
-        found = [f for f in found if not any(part.startswith(".") for part in f.relative_to(root).parts)]
+        found = sequences_in(Path(asset))
         folders += found
         others += [] if found else [asset]
     objects = [f.parent.name for f in folders]

@@ -11,7 +11,7 @@ from PIL import Image
 
 from timesplat.datagen import pixels, rigs
 from timesplat.datagen import sequence as sq
-from timesplat.datagen.sequence import InputError, Normalisation, Passes, Sequence, View
+from timesplat.datagen.sequence import InputError, Normalisation, Passes, Sequence, View, sequences_in
 
 
 def make(folder, frames=3, size=(6, 4), passes=True, provenance=None):
@@ -150,6 +150,16 @@ def test_damage_is_named(tmp_path, case):
     with pytest.raises(InputError) as e:
         sq.read_sequence(tmp_path / "a")
     sentence(e, str(tmp_path / "a"), word)
+
+
+def test_found_at_any_depth_but_only_when_finished(tmp_path):
+    for name in ("b/walk", "a", "a/deeper/run", ".c.x7/half", "b/.walk.y8", "empty"):
+        (tmp_path / name).mkdir(parents=True)
+        if name != "empty":
+            (tmp_path / name / "transforms.json").touch()
+    assert sequences_in(tmp_path) == [tmp_path / name for name in ("a", "a/deeper/run", "b/walk")]
+    assert sequences_in(tmp_path / "b" / "walk") == [tmp_path / "b" / "walk"]
+    assert sequences_in(tmp_path / "nowhere") == []
 
 
 def test_missing_folder_is_named(tmp_path):

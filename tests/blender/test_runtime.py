@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import tomllib
 import zipfile
@@ -149,6 +150,30 @@ def test_no_network(tmp_path):
     run = Run(tmp_path, "install", env, build="cuda")
     assert run.code == 1 and not run.folder.exists()
     assert run.end["message"].startswith("The package index cannot be reached (")
+
+
+def test_counts_while_pip_makes_and_removes_its_folders(tmp_path):
+    kept = tmp_path / "pip-unpack-1" / "torch.whl"
+    kept.parent.mkdir()
+    kept.write_bytes(b"x" * 1000)
+    rounds, finished = 0, threading.Event()
+
+    def churn():
+        nonlocal rounds
+        while not finished.is_set():
+            (tmp_path / "pip-build-tracker-2").mkdir()
+            (tmp_path / "pip-build-tracker-2" / "a.whl").touch()
+            shutil.rmtree(tmp_path / "pip-build-tracker-2")
+            rounds += 1
+
+    thread = threading.Thread(target=churn)
+    thread.start()
+    try:
+        assert {runtime._fetched(tmp_path) for _ in range(1000)} == {1000}
+    finally:
+        finished.set()
+        thread.join()
+    assert rounds > 10
 
 
 def test_the_cpu_build_never_takes_cuda(tmp_path, index):
