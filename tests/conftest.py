@@ -1,6 +1,14 @@
-"""Shared by all tests: the --slow switch."""
+"""Shared by all tests: the --slow switch, and what makes every run the same."""
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# The same examples on every run, however slow the machine is, and none kept from run to run. To search for new ones:
+# pytest --hypothesis-profile=default
+settings.register_profile(
+    "same", derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("same")
 
 
 def pytest_addoption(parser):
