@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Original, reconstruction and their difference side by side, at the frame that is shown: `timesplat.compare`.
+"""Original and reconstruction: which of them the scene shows (`timesplat.show`), and both with their difference side by
+side at the present frame (`timesplat.compare`).
 
-Both are rendered by Cycles, small, in a Blender of their own (`beside`), as the capture rendered what the asset was
-made from: with Even Light where that was on, over white, colours as they are. The picture is the image
+For the latter both are rendered by Cycles, small, in a Blender of their own (`beside`), as the capture rendered what
+the asset was made from: with Even Light where that was on, over white, colours as they are. The picture is the image
 "Timesplat Compare".
 """
 
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from bpy.props import IntProperty
+from bpy.props import EnumProperty, IntProperty
 from mathutils import Matrix
 
 from ..datagen import capture
@@ -26,24 +27,30 @@ SPLAT_SAMPLES = 2  # splats are smooth and glow by themselves: more samples chan
 GAIN = 4  # the difference is shown this many times as strong
 
 
+def originals_of(ob, context) -> list:
+    """The objects that the asset was made from: those that `timesplat_source` names, else all that renders show but
+    assets. Raises InputError where there is none in the scene."""
+    scene, names = context.scene, ob.get("timesplat_source")
+    found = [scene.objects[name] for name in names or () if name in scene.objects]
+    if names is None:
+        found = shown_objects(scene, context.view_layer)
+    found = [o for o in found if o.type not in ("CAMERA", "LIGHT") and not o.get("timesplat")]
+    if not found:
+        raise InputError(f"{ob.name}: what it was made from is not in this scene; open the scene that has it.")
+    return found
+
+
 def start(ob, context, size: int, samples: int) -> jobs.Job:
     """Starts the comparison as a Job; its end shows the picture. The view is the scene's camera's, or without one the
-    3D view's; `size` pixels is its longer side, `samples` are the original's. What the asset was made from are the
-    objects that `timesplat_source` names, else all that renders show but assets. Raises InputError where there is no
-    view or nothing to compare with."""
+    3D view's; `size` pixels is its longer side, `samples` are the original's. Raises InputError where there is no view
+    or nothing to compare with."""
     scene = context.scene
     if not hasattr(scene, "cycles"):
         raise InputError("Cycles, which renders the comparison, is switched off; enable it in the preferences.")
-    names = ob.get("timesplat_source")
-    shown = shown_objects(scene, context.view_layer)
-    originals = shown if names is None else [scene.objects[name] for name in names if name in scene.objects]
-    originals = [o for o in originals if o.type not in ("CAMERA", "LIGHT") and not o.get("timesplat")]
-    if not originals:
-        raise InputError(f"{ob.name}: what it was made from is not in this scene; open the scene that has it.")
     request = {
         "asset": ob.name,
-        "originals": [o.name for o in originals],
-        "lights": [o.name for o in shown if o.type == "LIGHT"],
+        "originals": [o.name for o in originals_of(ob, context)],
+        "lights": [o.name for o in shown_objects(scene, context.view_layer) if o.type == "LIGHT"],
         "even": bool(ob.get("timesplat_lighting", True)),
         "view": None if scene.camera and scene.camera.type == "CAMERA" else _view(context),
         "size": size,
@@ -163,6 +170,40 @@ def show(image, context) -> None:
     areas[0].tag_redraw()
 
 
+class TIMESPLAT_OT_show(bpy.types.Operator):
+    """Show the original, the reconstruction or both, in 3D views and in renders"""
+
+    bl_idname = "timesplat.show"
+    bl_label = "Show"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
+
+    what: EnumProperty(
+        name="Show",
+        items=[
+            ("ORIGINAL", "Original", "What the reconstruction was made from, alone"),
+            ("BOTH", "Both", "The original and the reconstruction, one over the other"),
+            ("RESULT", "Result", "The reconstruction alone"),
+        ],
+        default="RESULT",
+    )
+
+    poll = edit.TIMESPLAT_OT_delete.poll
+
+    def execute(self, context):
+        try:
+            originals = originals_of(context.object, context)
+        except InputError as e:
+            self.report({"ERROR"}, str(e))
+            return {"CANCELLED"}
+        hidden = dict.fromkeys(originals, self.what == "RESULT") | {context.object: self.what == "ORIGINAL"}
+        for ob, hide in hidden.items():
+            if ob.name in context.view_layer.objects:
+                ob.hide_set(hide)
+            if ob.is_editable:  # what is linked from another file is not
+                ob.hide_render = hide
+        return {"FINISHED"}
+
+
 class TIMESPLAT_OT_compare(bpy.types.Operator):
     """Render the original, the reconstruction and their difference at this frame, side by side"""
 
@@ -193,12 +234,17 @@ class TIMESPLAT_OT_compare(bpy.types.Operator):
         return {"FINISHED"}
 
 
+CLASSES = (TIMESPLAT_OT_show, TIMESPLAT_OT_compare)
+
+
 def register() -> None:
-    bpy.utils.register_class(TIMESPLAT_OT_compare)
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
 
 
 def unregister() -> None:
-    bpy.utils.unregister_class(TIMESPLAT_OT_compare)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
 
 
 if __name__ == "__main__":

@@ -250,6 +250,7 @@ class _Result:
             column = layout.column(align=True)
             column.label(text=f"{transform} changes the colours", icon="ERROR")
             column.operator("timesplat.set_standard")
+        layout.row(align=True).operator_enum("timesplat.show", "what")
         column = layout.column(align=True)
         column.operator("timesplat.compare", icon="IMAGE_DATA")
         column.operator("timesplat.bake", icon="ACTION")

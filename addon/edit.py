@@ -277,6 +277,7 @@ class TIMESPLAT_MT_result(bpy.types.Menu):
 
     def draw(self, context):
         layout = self.layout
+        layout.operator_enum("timesplat.show", "what")
         layout.operator("timesplat.compare")
         layout.operator("timesplat.bake")
         layout.separator()

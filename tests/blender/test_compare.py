@@ -39,7 +39,14 @@ def thirds(image):
     return np.split(a, 3, 1)
 def at(a, x, y):
     return a[y, x].tolist()
-told = {}
+def hidden():
+    return [[x.hide_get(), x.hide_render] for x in (ball, cube, ob)]
+told = {"shown": [hidden()]}
+ob["timesplat_source"] = [ball.name]
+for what in ("RESULT", "ORIGINAL", "BOTH"):
+    bpy.ops.timesplat.show(what=what)
+    told["shown"].append(hidden())
+del ob["timesplat_source"]
 try:
     bpy.ops.timesplat.compare()
 except RuntimeError as e:
@@ -90,6 +97,8 @@ def test_compare(blender, tmp_path):
     asset = Asset(**{k: np.array(v, np.float32) for k, v in one.items()}, clip=Clip(24, 1, 24))
     write_ply(tmp_path / "a.ply", asset)
     told = blender(SCENE, tmp_path / "a.ply")
+    yes, no = [True, True], [False, False]
+    assert told["shown"] == [[no, no, no], [yes, no, no], [no, no, yes], [no, no, no]]
     assert told["done"] == ["FINISHED"] and told["same"] and told["size"] == [288, 64]
     assert "no camera" in told["blind"] and "not in this scene" in told["gone"]
     srgb = [1.055 * x ** (1 / 2.4) - 0.055 for x in (0.8, 0.1, 0.1)]
