@@ -9,7 +9,6 @@ when all is done.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -79,7 +78,6 @@ def start(chosen, context) -> jobs.Job:
     """Starts the Job that these settings ask for. Raises InputError before anything has been done."""
     python = preferences.worker_python(context)
     shot = request(chosen, context)
-    frames = shot["frames"]
     checkpoint = bpy.path.abspath(chosen.checkpoint) if getattr(chosen, "checkpoint", "") else ""
     if checkpoint and not Path(checkpoint).is_file():
         raise InputError(f"{checkpoint}: no such checkpoint; correct it, or leave it empty.")
@@ -109,9 +107,7 @@ def start(chosen, context) -> jobs.Job:
     names = [n for n in shot["objects"] if context.scene.objects[n].type not in ("LIGHT", "CAMERA")]
 
     def finish(event: dict, folder: Path) -> str:
-        # the Sequence counts frames from 0; in this scene the clip lies where it was taken from
         asset = read_ply(folder / "asset.ply")
-        asset.clip = replace(asset.clip, frame_start=frames[0], frame_end=frames[-1])
         if not (asked["budget"] or asked["refine"]):
             settings.learn_number(asked["method"], len(asset), pixels)
         ob = display.add_asset(asset, "Timesplat", look=look, context=bpy.context)
