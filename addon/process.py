@@ -110,7 +110,8 @@ class Child:
                         self._end = event
                     self._news.notify_all()
         self.process.wait()
-        self._logger.join(2.0)  # a grandchild may hold the pipe
+        self._end_group()
+        self._logger.join(10.0)  # what has left the group may hold the pipe
         with self._news:
             self._end = self._end or {"event": "error", "message": self._last_words()}
             self._news.notify_all()
@@ -163,14 +164,17 @@ class Child:
     def kill(self) -> None:
         """Ends the process and its children, now. Harmless when it has ended."""
         _running.discard(self)
+        self._end_group()
+        self.process.wait()
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+
+    def _end_group(self) -> None:
         if os.name == "posix":
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.process.pid, signal.SIGKILL)  # what it started goes too, even after its own end
         elif self.process.poll() is None:
             subprocess.run(["taskkill", "/F", "/T", "/PID", str(self.process.pid)], capture_output=True)
-        self.process.wait()
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
 
 
 def _pieces(pipe):
