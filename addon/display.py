@@ -235,10 +235,11 @@ class _Result:
         layout.use_property_split = True
         count = len(ob.data.points if ob.type == "POINTCLOUD" else ob.data.vertices)
         layout.label(text=f"{count:,} Gaussians", icon="POINTCLOUD_DATA")
+        layout.row(align=True).operator_enum("timesplat.show", "what")
         panel, column = "", layout.column(align=True)
         for name, (group, *_) in nodes.SLIDERS.items():
             found = nodes.rna(modifier, name)
-            if found is None:
+            if found is None or (name in ("Crop Min", "Crop Max") and not nodes.get_input(modifier, "Crop")):
                 continue
             if group != panel:
                 panel, column = group, layout.column(align=True)
@@ -250,7 +251,6 @@ class _Result:
             column = layout.column(align=True)
             column.label(text=f"{transform} changes the colours", icon="ERROR")
             column.operator("timesplat.set_standard")
-        layout.row(align=True).operator_enum("timesplat.show", "what")
         column = layout.column(align=True)
         column.operator("timesplat.compare", icon="IMAGE_DATA")
         column.operator("timesplat.bake", icon="ACTION")

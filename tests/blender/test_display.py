@@ -206,20 +206,25 @@ class Layout:
         drawn[text] = key
 panel = types.SimpleNamespace(layout=Layout())
 scene = bpy.context.scene
+display.set_input(display.sampler(ob), "Crop", True)
 for transform in ("AgX", "Standard"):
     scene.view_settings.view_transform = transform
     buttons.clear()
     display.TIMESPLAT_PT_result.draw(panel, bpy.context)
     if transform == "AgX":
         warned = list(buttons)
+all_drawn = list(drawn)
+drawn.clear()
+display.set_input(display.sampler(ob), "Crop", False)
+display.TIMESPLAT_PT_result.draw(panel, bpy.context)
 scene.view_settings.view_transform = "AgX"
 part("addon").register()
 bpy.ops.timesplat.set_standard()
 poll = [display.TIMESPLAT_PT_result.poll(bpy.context)]
 bpy.ops.object.delete()
 poll.append(display.TIMESPLAT_PT_result.poll(bpy.context))
-tell(drawn=list(drawn), sliders=list(nodes.SLIDERS), warned=warned, buttons=buttons, labels=labels, poll=poll,
-     transform=scene.view_settings.view_transform)
+tell(drawn=all_drawn, uncropped=list(drawn), sliders=list(nodes.SLIDERS), warned=warned, buttons=buttons,
+     labels=labels, poll=poll, transform=scene.view_settings.view_transform)
 part("addon").unregister()
 """
 
@@ -228,6 +233,7 @@ def test_the_panel_shows_the_modifiers_own_sliders(blender, tmp_path):
     write_ply(tmp_path / "a.ply", make(1234))
     told = blender(PANEL, tmp_path / "a.ply")
     assert told["drawn"] == told["sliders"] and told["labels"][0] == "1,234 Gaussians"
+    assert told["uncropped"] == [x for x in told["sliders"] if x not in ("Crop Min", "Crop Max")]
     assert "timesplat.set_standard" in told["warned"] and "timesplat.set_standard" not in told["buttons"]
     assert {"timesplat.compare", "timesplat.bake", "timesplat.delete"} <= set(told["buttons"])
     assert told["transform"] == "Standard" and told["poll"] == [True, False]
