@@ -39,12 +39,13 @@ class Job:
     """state: running, waiting (for `bring`), done, failed or cancelled; fraction 0..1 and text: how far it is;
     message: how it ended."""
 
-    def __init__(self, label: str, stages: list, finish, shares, scene: str | None) -> None:
+    def __init__(self, label: str, stages: list, finish, shares, scene: str | None, partly: str = "") -> None:
         self.label, self.number, self.session, self.scene = label, next(_numbers), _session, scene
         self.state, self.fraction, self.text, self.message = "running", 0.0, "starting", ""
         self._stages, self._finish = list(stages), finish
         self._shares = list(shares or [1 / len(stages)] * len(stages))
         self._before, self._log, self._event = 0.0, "", {}
+        self._partly, self._kept = partly, ""
         self.folder = Path(tempfile.mkdtemp(prefix=f"run-{os.getpid()}-", dir=user_folder("runs")))
         self.child: process.Child | None = None
         try:
@@ -80,6 +81,7 @@ class Job:
             self.fraction = self._before
             self.child.kill()  # it has said all; what it leaves running goes too
             if self._stages:
+                self._kept = self._partly
                 self._next()
             else:
                 self._event, self.state, self.text = event, "waiting", "done"
@@ -108,7 +110,8 @@ class Job:
         if self.child:
             self.child.kill()
         self._log = self.log_text()
-        self.child, self.state, self.message, self.text = None, state, message, ""
+        said = message if state == "done" else f"{self._kept} {message}".strip()
+        self.child, self.state, self.message, self.text = None, state, said, ""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def log_text(self) -> str:
@@ -117,15 +120,21 @@ class Job:
 
 
 def start(
-    label: str, stages: list[Callable[[Path], process.Child]], finish=None, shares=None, scene: str | None = None
+    label: str,
+    stages: list[Callable[[Path], process.Child]],
+    finish=None,
+    shares=None,
+    scene: str | None = None,
+    partly: str = "",
 ) -> Job:
     """Starts a Job: `stages` run one after another, each is called with the Job's folder and starts a process;
     `shares` are their parts of the progress (default: equal ones). `finish(event, folder)` gets the last stage's
     "done" event and returns the message to show; where `scene` is named it brings something into this scene, and
-    is called when that can be done. Raises InputError where the first cannot be started."""
+    is called when that can be done. `partly`: what stands before the message where the first stage has done its part
+    for good and a later one fails or is cancelled. Raises InputError where the first cannot be started."""
     sweep()
     try:
-        job = Job(label, stages, finish, shares, scene)
+        job = Job(label, stages, finish, shares, scene, partly)
     except OSError as e:
         raise InputError(f"{user_folder('runs')}: it cannot be written ({e.strerror or e}); make room there.") from None
     ended = [j for j in JOBS if j.state not in ("running", "waiting")]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The buttons in the preferences: install the model runtime, take it away, test it. Each is a Job (`jobs`); with
-`blender -b` the operators return when all is done. The network is asked only by Install, and only where Blender's
-own setting allows it.
+"""The buttons in the preferences: install the model runtime (and test it at once, which compiles its kernels), take it
+away, test it. Each is a Job (`jobs`); with `blender -b` the operators return when all is done. The network is asked
+only by Install, and only where Blender's own setting allows it.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class TIMESPLAT_OT_install_runtime(_Button, bpy.types.Operator):
             raise InputError(OFFLINE)
         if self.build == "cuda" and sys.platform == "darwin":
             raise InputError("CUDA does not exist for this computer; choose CPU, which has Metal too.")
-        return jobs.start("Install runtime", [_stage({"task": "install", "build": self.build})], _installed)
+        stages = [_stage({"task": "install", "build": self.build}), _test_installed]
+        return jobs.start("Install runtime", stages, _installed, [0.85, 0.15], partly="The runtime is installed.")
 
 
 class TIMESPLAT_OT_uninstall_runtime(_Button, bpy.types.Operator):
@@ -98,9 +99,7 @@ class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
     bl_label = "Self-Test"
 
     def start(self, context):
-        python = preferences.worker_python(context)
-        request = {"task": "selftest", "device": preferences.device(context)}
-        request["checkpoint"] = preferences.checkpoint(context)
+        python, request = preferences.worker_python(context), _test(context)
         return jobs.start("Self-test", [lambda folder: process.worker(python, request, folder)], _tested)
 
 
@@ -111,9 +110,26 @@ def _stage(request: dict):
     return lambda folder: process.Child(command, {**request, "work": str(folder)}, folder)
 
 
-def _installed(event: dict, folder: Path) -> str:
+def _test(context) -> dict:
+    """What the worker is asked for. Raises InputError."""
+    return {
+        "task": "selftest",
+        "device": preferences.device(context),
+        "checkpoint": preferences.checkpoint(context),
+    }
+
+
+def _test_installed(folder: Path) -> process.Child:
+    """The stage after the installation: the self-test of what was installed."""
     preferences.look_again()
-    return f"Runtime installed: torch {event['versions']['torch']}, {_mega(event['bytes'])} on disk."
+    python = preferences.runtime_folder() / preferences.runtime()["python"]
+    return process.worker(str(python), _test(bpy.context), folder)
+
+
+def _installed(event: dict, folder: Path) -> str:
+    told = preferences.runtime()
+    said = _tested(event, folder)
+    return f"Runtime installed: torch {told['versions']['torch']}, {_mega(told['bytes'])} on disk. {said}"
 
 
 def _uninstalled(event: dict, folder: Path) -> str:

@@ -294,20 +294,36 @@ def op(name, **options):
         return str(e)
 def left():
     return sorted(x.name for n in ("runs", "runtime") for x in preferences.user_folder(n, create=False).glob("*"))
+process, asked = part("addon.process"), []
+report = ["ok lift: fine", "ok network: fine"]
+def worker(python, request, folder):
+    asked.append([python, request])
+    code = f"print({json.dumps({'event': 'done', 'report': report})!r})" if report else "raise SystemExit('no AVX')"
+    return process.Child([sys.argv[1], "-c", code], request, folder)
+process.worker = worker
+text = lambda: bpy.data.texts["Timesplat self-test"].as_string().splitlines()
 """
-WHOLE = """
+WHOLE = r"""
 result = dict(offline=op("install_runtime"), refused=left())
 bpy.context.preferences.system.use_online_access = True
 result |= dict(online=bpy.app.online_access, able=able, installed=op("install_runtime"), left=left())
 if able:
     told = preferences.runtime()
     result |= dict(versions=told["versions"], bytes=told["bytes"], python=preferences.worker_python(),
-                   folder=str(preferences.runtime_folder()), message=jobs.JOBS[-1].message)
+                   folder=str(preferences.runtime_folder()), message=jobs.JOBS[-1].message, text=text(),
+                   asked=asked[:])
+    done = [sys.argv[1], "-c", "print('{\"event\": \"done\"}')"]
+    stage, setup._stage = setup._stage, lambda request: lambda folder: process.Child(done, request, folder)
+    report[:] = ["ok lift: fine", "FAILED: network: no weights; copy them again."]
+    result |= dict(ill=op("install_runtime"), one=text(), stays=preferences.runtime() == told)
+    report.clear()
+    result |= dict(dead=op("install_runtime"), still=left())
     os.unlink(preferences.worker_python())
     try:
         preferences.worker_python()
     except Exception as e:
         result["dangling"] = str(e)
+    setup._stage = stage
     result |= dict(removed=op("uninstall_runtime"), after=left(), state=preferences.runtime())
     result["other"] = preferences.worker_python()
 tell(**result)
@@ -315,7 +331,7 @@ tell(**result)
 
 
 def test_installed_from_the_preferences(installed, index):
-    told = installed(ABLE + WHOLE, env=pip(index), timeout=120)
+    told = installed(ABLE + WHOLE, sys.executable, env=pip(index), timeout=240)
     assert "Preferences > System > Network > Allow Online Access" in told["offline"] and told["refused"] == []
     assert told["online"] is True
     if not told["able"]:  # Debian's Blender
@@ -323,7 +339,14 @@ def test_installed_from_the_preferences(installed, index):
         return
     assert told["installed"] == ["FINISHED"] and told["left"] == ["venv"]
     assert told["versions"]["torch"] == "2.6.7" and told["python"].startswith(told["folder"])
-    assert told["message"] == f"Runtime installed: torch 2.6.7, {told['bytes'] / 1e6:.0f} MB on disk."
+    size = f"{told['bytes'] / 1e6:.0f} MB on disk"
+    assert told["message"] == f"Runtime installed: torch 2.6.7, {size}. Self-test: all 2 passed."
+    assert told["text"] == ["ok lift: fine", "ok network: fine"]
+    assert told["asked"] == [[told["python"], {"task": "selftest", "device": "cpu", "checkpoint": None}]]
+    assert "The runtime is installed. Self-test: 1 of 2 failed; the text 'Timesplat self-test' says" in told["ill"]
+    assert told["one"][1].startswith("FAILED: network") and told["stays"]
+    assert "The runtime is installed. The process ended with code 1: no AVX" in told["dead"]
+    assert told["still"] == ["venv"]
     assert "no such file; the Blender that the runtime was made with is gone" in told["dangling"]
     assert told["removed"] == ["FINISHED"] and told["after"] == [] and told["state"] is None
     assert told["other"] == sys.executable  # TIMESPLAT_PYTHON
@@ -372,14 +395,6 @@ def test_cancelled_in_the_middle_nothing_is_left(installed, index):
 
 SELF_TEST = """
 prefs = bpy.context.preferences.addons[name].preferences
-process, asked = part("addon.process"), []
-def worker(python, request, folder):
-    asked.append([python, request])
-    says = {"event": "done", "report": report}
-    return process.Child([sys.argv[1], "-c", f"print({json.dumps(says)!r})"], request, folder)
-process.worker = worker
-text = lambda: bpy.data.texts["Timesplat self-test"].as_string().splitlines()
-report = ["ok lift: fine", "ok network: fine"]
 result = dict(well=op("self_test"), message=jobs.JOBS[-1].message, two=text())
 open(sys.argv[2], "w").write("weights")
 prefs.checkpoint, prefs.device = sys.argv[2], "mps"
