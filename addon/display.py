@@ -235,7 +235,9 @@ class _Result:
         layout.use_property_split = True
         count = len(ob.data.points if ob.type == "POINTCLOUD" else ob.data.vertices)
         layout.label(text=f"{count:,} Gaussians", icon="POINTCLOUD_DATA")
-        layout.row(align=True).operator_enum("timesplat.show", "what")
+        row = layout.row(align=True)
+        row.use_property_split = False  # which would put its buttons below one another
+        row.operator_enum("timesplat.show", "what")
         panel, column = "", layout.column(align=True)
         for name, (group, *_) in nodes.SLIDERS.items():
             found = nodes.rna(modifier, name)
