@@ -236,8 +236,8 @@ class _Result:
         count = len(ob.data.points if ob.type == "POINTCLOUD" else ob.data.vertices)
         layout.label(text=f"{count:,} Gaussians", icon="POINTCLOUD_DATA")
         row = layout.row(align=True)
-        row.use_property_split = False  # which would put its buttons below one another
-        row.operator_enum("timesplat.show", "what")
+        for what in ("Original", "Both", "Result"):  # operator_enum would put them below one another
+            row.operator("timesplat.show", text=what).what = what.upper()
         panel, column = "", layout.column(align=True)
         for name, (group, *_) in nodes.SLIDERS.items():
             found = nodes.rna(modifier, name)

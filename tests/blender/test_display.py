@@ -195,9 +195,8 @@ class Layout:
     def row(self, **_): return self
     column = row
     def label(self, text="", **_): labels.append(text)
-    def operator(self, name, **_): buttons.append(name)
+    def operator(self, name, **_): return buttons.append(name) or types.SimpleNamespace()
     def operator_menu_enum(self, name, key, **_): buttons.append(name)
-    operator_enum = operator_menu_enum
     def prop(self, owner, key, text=""):
         if key == "value":
             owner.bl_rna.properties[key]
