@@ -85,7 +85,7 @@ class Run:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             env={**clean, "TMPDIR": str(work), **env}, start_new_session=True,
         ) as process:  # fmt: skip
-            said, self.log = process.communicate(json.dumps(request) + "\n", timeout=120)
+            said, self.log = process.communicate(json.dumps(request) + "\n", timeout=300)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         shutil.rmtree(work, ignore_errors=True)
@@ -147,6 +147,7 @@ def test_a_package_that_is_not_there(tmp_path, index):
 
 def test_no_network(tmp_path):
     env = {"PIP_CONFIG_FILE": os.devnull, "PIP_INDEX_URL": "http://127.0.0.1:9/simple", "PIP_RETRIES": "1"}
+    env |= {"NO_PROXY": "127.0.0.1", "no_proxy": "127.0.0.1"}
     run = Run(tmp_path, "install", env, build="cuda")
     assert run.code == 1 and not run.folder.exists()
     assert run.end["message"].startswith("The package index cannot be reached (")
@@ -156,24 +157,25 @@ def test_counts_while_pip_makes_and_removes_its_folders(tmp_path):
     kept = tmp_path / "pip-unpack-1" / "torch.whl"
     kept.parent.mkdir()
     kept.write_bytes(b"x" * 1000)
-    rounds, finished = 0, threading.Event()
+    finished, rounds, found = threading.Event(), 0, set()
 
-    def churn():
-        nonlocal rounds
+    def count():
         while not finished.is_set():
+            found.add(runtime._fetched(tmp_path))
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    try:
+        while rounds < 500 or not found:
             (tmp_path / "pip-build-tracker-2").mkdir()
             (tmp_path / "pip-build-tracker-2" / "a.whl").touch()
             shutil.rmtree(tmp_path / "pip-build-tracker-2")
             rounds += 1
-
-    thread = threading.Thread(target=churn)
-    thread.start()
-    try:
-        assert {runtime._fetched(tmp_path) for _ in range(1000)} == {1000}
+            time.sleep(0)  # the other's turn, where there is one core
     finally:
         finished.set()
         thread.join()
-    assert rounds > 10
+    assert found == {1000}
 
 
 def test_the_cpu_build_never_takes_cuda(tmp_path, index):
@@ -247,7 +249,7 @@ def test_a_python_without_ensurepip(tmp_path, monkeypatch):
 @pytest.mark.skipif(not Path("/proc/self/cwd").exists(), reason="looks at processes in /proc")
 def test_it_goes_with_blender(tmp_path, index):
     """Standard input ends when Blender is gone; then pip and what it started go too."""
-    wheel(index, "torch", "9.9", "import time; time.sleep(60)")
+    wheel(index, "torch", "9.9", "import time; time.sleep(999)")
     work = tmp_path / "work"
     work.mkdir()
     request = {"task": "install", "folder": str(tmp_path / "venv"), "work": str(work), "build": "cpu", "watch": True}
@@ -260,7 +262,7 @@ def test_it_goes_with_blender(tmp_path, index):
         process.stdin.flush()
         assert any("importing" in line for line in process.stdout)
         process.stdin.close()
-        assert process.wait(10) != 0
+        assert process.wait(60) != 0
 
     def here(pid: str) -> bool:
         try:
@@ -268,7 +270,7 @@ def test_it_goes_with_blender(tmp_path, index):
         except OSError:
             return False
 
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while (left := [pid for pid in os.listdir("/proc") if pid.isdigit() and here(pid)]) and time.monotonic() < end:
         time.sleep(0.05)
     assert left == [] and not (tmp_path / "venv").exists()
@@ -368,14 +370,15 @@ def cwd(p):
 seen = []
 for until in ("virtual", "importing"):
     job = jobs.start("Install runtime", [setup._stage({"task": "install", "build": "cpu"})], setup._installed)
-    for _ in range(600):
+    while until not in job.text and job.state == "running":
         job.step(0.1)
-        if until in job.text or job.state != "running":
-            break
     busy = op("install_runtime") if until == "importing" else ""
     before = len(alive())
     job.cancel()
-    time.sleep(0.3)
+    for _ in range(600):  # what was killed may take its time to die
+        if not alive():
+            break
+        time.sleep(0.1)
     seen.append([job.state, before > 0, alive(), left(), job.message])
 tell(able=True, seen=seen, busy=busy, log=job.log_text())
 """
@@ -383,7 +386,7 @@ tell(able=True, seen=seen, busy=busy, log=job.log_text())
 
 @pytest.mark.skipif(not Path("/proc/self/cwd").exists(), reason="looks at processes in /proc")
 def test_cancelled_in_the_middle_nothing_is_left(installed, index):
-    wheel(index, "torch", "9.9", "import time; time.sleep(60)")
+    wheel(index, "torch", "9.9", "import time; time.sleep(999)")
     told = installed(ABLE + "bpy.context.preferences.system.use_online_access = True\n" + CANCEL, env=pip(index))
     if not told["able"]:
         pytest.skip("this Blender's Python has no ensurepip")
