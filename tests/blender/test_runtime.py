@@ -157,21 +157,21 @@ def test_counts_while_pip_makes_and_removes_its_folders(tmp_path):
     kept = tmp_path / "pip-unpack-1" / "torch.whl"
     kept.parent.mkdir()
     kept.write_bytes(b"x" * 1000)
-    finished, rounds, found = threading.Event(), 0, set()
+    rounds, finished, found = 0, threading.Event(), set()
 
-    def count():
+    def churn():
+        nonlocal rounds
         while not finished.is_set():
-            found.add(runtime._fetched(tmp_path))
-
-    thread = threading.Thread(target=count)
-    thread.start()
-    try:
-        while rounds < 500 or not found:
             (tmp_path / "pip-build-tracker-2").mkdir()
             (tmp_path / "pip-build-tracker-2" / "a.whl").touch()
             shutil.rmtree(tmp_path / "pip-build-tracker-2")
             rounds += 1
-            time.sleep(0)  # the other's turn, where there is one core
+
+    thread = threading.Thread(target=churn)
+    thread.start()
+    try:
+        while rounds < 500 and thread.is_alive():
+            found.add(runtime._fetched(tmp_path))
     finally:
         finished.set()
         thread.join()
