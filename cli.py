@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from pathlib import Path
 
@@ -35,6 +36,9 @@ def main(argv: list[str] | None = None) -> int:
         sub.set_defaults(run=command)
     if argv is None:
         argv = sys.argv[1:]
+    for stream in (sys.stdout, sys.stderr):  # a console may lack letters of a file's name
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     args = parser.parse_args(argv)
     try:
         return args.run(args) or 0
@@ -196,7 +200,7 @@ def export(args: argparse.Namespace) -> int:
 
     from .model.asset import read_ply, write_ply
     from .model.slices import write_slice, write_slices
-    from .model.usd import SUFFIXES, check_usd, read_usd, write_usd
+    from .model.usd import SUFFIXES, check_usd, read_moving, write_usd
 
     usd = args.out is not None and args.out.suffix.lower() in SUFFIXES
     if (args.out is None) == (args.sequence is None):
@@ -205,7 +209,10 @@ def export(args: argparse.Namespace) -> int:
         raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
     if args.frame is not None and (usd or args.sequence):
         raise InputError("export: --frame is for one .ply or .splat; drop it.")
-    asset = (read_usd if args.asset.suffix.lower() in SUFFIXES else read_ply)(args.asset)
+    given = args.asset.suffix.lower() in SUFFIXES
+    asset, motion = read_moving(args.asset) if given else (read_ply(args.asset), None)
+    if motion is not None and not usd:
+        print(f"{args.asset}: it moves as a whole; what is written stands where that starts, USD would keep it")
     if args.sequence:
         count = write_slices(args.sequence, asset, args.asset.stem)
         print(f"{args.sequence}: {count} files")
@@ -215,7 +222,7 @@ def export(args: argparse.Namespace) -> int:
         count = write_slice(args.out, asset, args.frame)
     elif usd:
         more = {"original": args.original, "original_start": args.original_start}
-        write_usd(args.out, asset, mode=args.mode, half=args.half, **more)
+        write_usd(args.out, asset, mode=args.mode, half=args.half, motion=motion, **more)
     elif args.out.suffix.lower() == ".ply":
         write_ply(args.out, asset)
     elif args.out.suffix.lower() == ".blend":
@@ -239,7 +246,7 @@ def save_blend(asset: Path, out: Path) -> None:
     import subprocess
 
     command = [sys.executable, "-m", "timesplat.addon.display", str(asset), str(out)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
     if done.returncode:
         reason = (done.stderr.strip() or done.stdout.strip() or "Blender stopped").splitlines()[-1]
         raise InputError(f"{out}: the .blend was not written: {reason}")

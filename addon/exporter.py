@@ -4,14 +4,15 @@
     bpy.ops.timesplat.export_asset(filepath="a.usdz", half=True)          the suffix says the format
     bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame
 
-What the sliders do and what was deleted is in the file, and so is the object's place in the world at the current
-frame. USD is written by the worker, or where there is none with the pxr of Blender's own Python.
+What the sliders do and what was deleted is in the file, and so is the object's place in the world: at each frame in
+USD and in a folder of slices, else at the current one. Animated sliders are followed by slices alone. USD is written
+by the worker, or where there is none with the pxr of Blender's own Python.
 """
 
 from __future__ import annotations
 
 import tempfile
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import bpy
@@ -34,7 +35,11 @@ FORMAT_ITEMS = [
     ("USDZ", "USDZ (package)", "USD in one file with all it needs"),
     ("SLICE", "3DGS PLY, this frame", "For 3DGS viewers and tools: what is visible at the current frame"),
     ("SPLAT", ".splat, this frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
-    ("SLICES", "3DGS PLY, all frames", "A new folder with a .ply for every frame of the clip"),
+    (
+        "SLICES",
+        "3DGS PLY, all frames",
+        "A new folder with what the timeline shows at every frame of the scene",
+    ),
 ]
 MODE_ITEMS = [
     ("splats", "Splats", "A Gaussian splat prim, which older readers take as points"),
@@ -43,12 +48,9 @@ MODE_ITEMS = [
 ]
 
 
-def present(ob, apply_sliders: bool) -> Asset:
-    """The asset as the object shows it now, with its place in the world in the clip (see `slices.placed`).
-    Raises InputError."""
-    asset = held.applied(ob) if apply_sliders else held.asset_of(ob)
-    bpy.context.view_layer.update()  # a script may have moved it just now
-    matrix, clip = np.array(ob.matrix_world), asset.clip
+def place(asset: Asset, matrix: np.ndarray) -> Asset:
+    """The asset with its place in the world in the clip (see `slices.placed`). Raises InputError."""
+    clip = asset.clip
     own = np.diag([clip.scale, clip.scale, clip.scale, 1.0])
     own[:3, 3] = clip.translation
     if np.allclose(matrix, own, rtol=1e-6, atol=1e-6 * clip.scale):
@@ -56,17 +58,31 @@ def present(ob, apply_sliders: bool) -> Asset:
     return slices.placed(asset, matrix)
 
 
-def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, context) -> list[str]:
+def changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
+    """Where the object is at each of the frames, (F,4,4), or (1,4,4) where it stands still; and the names of
+    the sliders that change."""
+    found = [(np.array(ob.matrix_world), held.sliders(ob))]
+    if held.may_change(ob):
+        found = [(np.array(ob.matrix_world), held.sliders(ob)) for _ in held.steps(frames, context)]
+    first = found[0][1]
+    names = [k for k in first if k not in ("Look", "Point Size") and any(s[k] != first[k] for _, s in found)]
+    return np.stack([m for m, _ in found]), names
+
+
+def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, motion, context) -> list[str]:
     """Writes and validates; returns what the validators complain about. Raises InputError."""
     python = preferences.usd_python(context)
     if not python:
-        usd.write_usd(path, asset, mode=mode, half=half, original=original)
+        usd.write_usd(path, asset, mode=mode, half=half, original=original, motion=motion)
         return usd.check_usd(path)
     with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
         copy = Path(folder) / "asset.ply"
         write_ply(copy, asset)
         request = {"task": "export", "asset": str(copy), "out": str(path.resolve()), "mode": mode, "half": half}
         request |= {"original": str(original)} if original else {}
+        if motion is not None:
+            request["motion"] = str(Path(folder) / "motion.npy")
+            np.save(request["motion"], motion)
         return process.ask(python, request)["complaints"]
 
 
@@ -219,7 +235,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
                 raise InputError("No file was named; choose one.")
             path = Path(bpy.path.abspath(with_suffix(self.filepath, self.format)))
             with busy(context):
-                level, said = self.write(path, present(context.object, self.apply_sliders), context)
+                level, said = self.write(path, context)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
@@ -229,24 +245,43 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         self.report({level}, f"{path.name}: {said}")
         return {"FINISHED"}
 
-    def write(self, path: Path, asset: Asset, context) -> tuple[str, str]:
+    def write(self, path: Path, context) -> tuple[str, str]:
         """-> the report's level and text."""
-        frame = context.scene.frame_current_final
-        if self.format == "PLY":
-            write_ply(path, asset)
-        elif self.format in ("SLICE", "SPLAT"):
-            return "INFO", f"{slices.write_slice(path, asset, frame)} Gaussians of frame {frame:g}."
-        elif self.format == "SLICES":
-            return "INFO", f"{slices.write_slices(path, asset, path.name)} files."
-        elif self.with_original:
-            with original_usd(context.object, path, asset.clip.frames, context) as original:
-                return self.write_usd(path, asset, original, context)
-        else:
-            return self.write_usd(path, asset, None, context)
-        return "INFO", f"{len(asset)} Gaussians."
+        ob, scene = context.object, context.scene
+        context.view_layer.update()  # a script may have moved it just now
+        frame = scene.frame_current_final
+        if self.format in ("SLICE", "SPLAT"):
+            part = held.moment(ob, held.asset_of(ob), frame, self.apply_sliders)
+            return "INFO", f"{slices.write_slice(path, part, frame, cut=0)} Gaussians of frame {frame:g}."
+        if self.format == "SLICES":
+            asset = held.asset_of(ob)
+            frames = range(scene.frame_start, scene.frame_end + 1) if self.apply_sliders else asset.clip.frames
+            steps = held.steps(frames, context)
+            moments = ((f, held.moment(ob, asset, f, self.apply_sliders)) for f in steps)
+            with closing(steps):
+                return "INFO", f"{slices.write_moments(path, moments, path.name, cut=0)} files."
 
-    def write_usd(self, path: Path, asset: Asset, original: Path | None, context) -> tuple[str, str]:
-        complaints = write_usd(path, asset, mode=self.mode, half=self.half, original=original, context=context)
+        asset = held.applied(ob) if self.apply_sliders else held.asset_of(ob)
+        now = np.array(ob.matrix_world)
+        places, animated = changes(ob, asset.clip.frames, context)
+        rest, motion = slices.apart(places)
+        lost = animated if self.apply_sliders else []
+        if self.format == "PLY":
+            write_ply(path, place(asset, now))
+            lost = lost + ["place"] * (motion is not None)
+            level, said = "INFO", f"{len(asset)} Gaussians."
+        elif self.with_original:
+            with original_usd(ob, path, asset.clip.frames, context) as original:
+                level, said = self.write_usd(path, place(asset, rest), original, motion, context)
+        else:
+            level, said = self.write_usd(path, place(asset, rest), None, motion, context)
+        if lost:
+            said += f" Animated, but in the file as at frame {frame:g}: {', '.join(lost)}; 3DGS PLY, all frames, moves."
+        return "WARNING" if lost else level, said
+
+    def write_usd(self, path: Path, asset: Asset, original: Path | None, motion, context) -> tuple[str, str]:
+        options = {"mode": self.mode, "half": self.half, "original": original, "motion": motion}
+        complaints = write_usd(path, asset, **options, context=context)
         verdict = f"{len(complaints)} complaints" if complaints else "valid USD"
         text = bpy.data.texts.get(REPORT) or bpy.data.texts.new(REPORT)
         lines = [str(path), f"{len(asset)} Gaussians, mode {self.mode}, {path.stat().st_size:,} bytes", verdict]

@@ -7,12 +7,14 @@ moved since stays so in Blender only.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import bpy
 import numpy as np
 
 from ..datagen.sequence import InputError
+from ..model import slices
 from ..model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, check
 from . import display, nodes
 
@@ -116,11 +118,54 @@ def _chosen(ob, asset: Asset, s: dict) -> np.ndarray:
 def shown(ob, frame: float) -> tuple[np.ndarray, np.ndarray]:
     """(N,3) positions in normalised space of ALL Gaussians at a scene frame, and (N,) which of them the
     modifier shows then."""
-    asset, s = asset_of(ob), sliders(ob)
-    chosen = _chosen(ob, asset, s)
-    asset.sigma_t = asset.sigma_t * np.float32(s["Lifetime Scale"])
-    position, alpha = asset.at(model_time(s, frame))
-    return position, chosen & (alpha >= np.float32(s["Opacity Cut"]))
+    position, _, seen = _shown(ob, asset_of(ob), sliders(ob), frame)
+    return position, seen
+
+
+def _shown(ob, asset: Asset, s: dict, frame: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    lives = replace(asset, sigma_t=asset.sigma_t * np.float32(s["Lifetime Scale"]))
+    position, alpha = lives.at(model_time(s, frame))
+    return position, alpha, _chosen(ob, asset, s) & (alpha >= np.float32(s["Opacity Cut"]))
+
+
+def moment(ob, asset: Asset, frame: float, apply_sliders: bool = True) -> Asset:
+    """What the timeline shows of `asset_of(ob)` at the scene's present frame, as an asset in the world that does not
+    change, whatever Repeat is or is animated. It holds no Gaussian fainter than Opacity Cut, but a clear one where
+    nothing is shown: empty files are refused by many. Raises InputError."""
+    clip = asset.clip
+    own = {"Frame Start": clip.frame_start, "Frame End": clip.frame_end}
+    s = sliders(ob) if apply_sliders else {k: v[2] for k, v in nodes.SLIDERS.items()} | own
+    position, alpha, seen = _shown(ob, asset, s, frame)
+    matrix = np.array(ob.matrix_world)
+    if not seen.any() or abs(np.linalg.det(matrix[:3, :3])) < 1e-27:
+        matrix, seen, alpha = np.eye(4), np.arange(len(asset)) == 0, np.zeros(len(asset))
+    return slices.placed(_masked(_still(asset, position, alpha), seen), matrix)
+
+
+# ---------------------------------------------------------------- over the timeline
+
+
+def may_change(ob) -> bool:
+    """Whether the object's place or its sliders might change with the frame: quick, and True in doubt."""
+    above = ob
+    while above:
+        bound = above.constraints or above.rigid_body or (above.parent and above.parent_type != "OBJECT")
+        if above.animation_data or bound:
+            return True
+        above = above.parent
+    return False
+
+
+def steps(frames: Iterable[int], context) -> Iterator[int]:
+    """Takes the scene to each of the frames, and back in the end."""
+    scene = context.scene
+    now = scene.frame_current, scene.frame_subframe
+    try:
+        for frame in frames:
+            scene.frame_set(frame)
+            yield frame
+    finally:
+        scene.frame_set(now[0], subframe=now[1])
 
 
 def peak(asset: Asset) -> np.ndarray:
@@ -140,7 +185,8 @@ def applied(ob, frames: tuple[int, int] | None = None) -> Asset:
     Raises InputError where Repeat is not Hold, or nothing is left."""
     asset, s = asset_of(ob), sliders(ob)
     if s["Repeat"] != "Hold":
-        raise InputError(f"{ob.name}: Repeat is {s['Repeat']}, and an asset only holds at its ends; set it to Hold.")
+        raise InputError(f"{ob.name}: Repeat is {s['Repeat']}, and an asset only holds at its ends; set it to Hold, or "
+                         "export 3DGS PLY, all frames.")  # fmt: skip
     asset = _masked(asset, _chosen(ob, asset, s))
     asset.sigma_t = asset.sigma_t * np.float32(s["Lifetime Scale"])
     if len(asset):
@@ -184,8 +230,11 @@ def _retimed(asset: Asset, s: dict, frames: tuple[int, int] | None) -> Asset:
 
 def _frozen(asset: Asset, time: float, clip: Clip) -> Asset:
     """What is there at one time, for all time."""
-    position, alpha = asset.at(time)
+    return replace(_still(asset, *asset.at(time)), clip=clip)
+
+
+def _still(asset: Asset, position: np.ndarray, alpha: np.ndarray) -> Asset:
+    """It is there with these opacities for all time."""
     n = len(asset)
-    still = {"t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
-    still = {key: a.astype(np.float32) for key, a in still.items()}
-    return replace(asset, xyz=position, opacity=alpha, clip=clip, **still)
+    still = {"t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T), "opacity": alpha}
+    return replace(asset, xyz=position, **{key: a.astype(np.float32) for key, a in still.items()})

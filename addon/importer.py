@@ -16,7 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+from mathutils import Matrix, Quaternion
 
 from ..datagen.sequence import InputError
 from ..model import formats, usd
@@ -38,10 +40,11 @@ TURNS = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # about X
 SUFFIXES = (*formats.SUFFIXES, *usd.SUFFIXES)
 
 
-def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> formats.Loaded:
-    """One asset from a file of any kind, or from several that are one frame each. Raises InputError."""
+def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tuple[formats.Loaded, np.ndarray | None]:
+    """One asset from a file of any kind, or from several that are one frame each; and its motion as a whole, if it
+    has one (see `usd.read_moving`). Raises InputError."""
     if not any(p.suffix.lower() in usd.SUFFIXES for p in paths):
-        return formats.read_sequence(paths, fps=fps, frame_start=frame_start)
+        return formats.read_sequence(paths, fps=fps, frame_start=frame_start), None
     if len(paths) > 1:
         raise InputError("USD files hold their frames themselves; import them one by one.")
     (path,) = paths
@@ -49,12 +52,32 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> fo
         raise InputError(f"{path}: no such file; check the name.")
     python = preferences.usd_python(context)
     if not python:
-        return formats.Loaded(usd.read_usd(path), "Z")
+        asset, motion = usd.read_moving(path)
+        return formats.Loaded(asset, "Z"), motion
     with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
-        copy = Path(folder) / "asset.ply"
-        request = {"task": "import", "source": str(path.resolve()), "asset": str(copy)}
+        copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
+        request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
         process.ask(python, request)
-        return formats.Loaded(read_ply(copy), "Z")
+        return formats.Loaded(read_ply(copy), "Z"), np.load(moves) if moves.exists() else None
+
+
+def animate(ob, frames: range, motion: np.ndarray) -> bool:
+    """Keys the object's transform so that it is at each frame where `motion` (F,4,4) takes it from where it is
+    now. False where that cannot be keyed, because it shears."""
+    places = [Matrix(m @ np.array(ob.matrix_world)) for m in motion]
+    parts = [m.decompose() for m in places]
+    size = max(abs(x) for m in places for row in m for x in row)
+    for m, part in zip(places, parts, strict=True):
+        if not np.allclose(m, Matrix.LocRotScale(*part), atol=1e-4 * size):
+            return False
+    ob.rotation_mode, before = "QUATERNION", Quaternion()
+    for frame, (location, turn, scale) in zip(frames, parts, strict=True):
+        turn.make_compatible(before)
+        ob.location, ob.rotation_quaternion, ob.scale = location, turn, scale
+        before = turn
+        for key in ("location", "rotation_quaternion", "scale"):
+            ob.keyframe_insert(key, frame=frame)
+    return True
 
 
 @contextmanager
@@ -143,7 +166,7 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         try:
             paths = self.paths()
             with busy(context):
-                loaded = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
+                loaded, motion = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
@@ -154,10 +177,15 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         name = path.stem if len(paths) == 1 else path.parent.name
         ob = display.add_asset(asset, name, look=self.look, cut=self.opacity_cut, context=context)
         ob.rotation_euler.x = TURNS[loaded.up if self.up == "AUTO" else self.up]
+        note = loaded.note
+        if motion is not None:
+            context.view_layer.update()
+            if not animate(ob, asset.clip.frames, motion):
+                note = "It moves in a way that shears it, which is left out: it stands where that starts."
         if self.use_clip:
             display.play_clip(context.scene, asset.clip)
         where = path.name if len(paths) == 1 else f"{len(paths)} files in {path.parent.name}"
-        said = f"{len(asset)} Gaussians from {where}; their sRGB colours are linear now. {loaded.note}"
+        said = f"{len(asset)} Gaussians from {where}; their sRGB colours are linear now. {note}"
         self.report({"INFO"}, said.strip())
         return {"FINISHED"}
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,6 +44,19 @@ def placed(asset: Asset, matrix: np.ndarray) -> Asset:
     return replace(asset, **moved)
 
 
+def apart(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Where something is at each frame, (F,4,4) into the world, as one place to rest at (4,4) and the motion (F,4,4)
+    that leads from there to each of them, None where it stands still. It rests at the first frame's, or, where
+    it starts as good as nothing and grows, as soon as it has half of its size. Raises InputError for a flat one."""
+    matrices = np.asarray(matrices, np.float64)
+    still = np.allclose(matrices, matrices[0], rtol=1e-9, atol=1e-12)
+    size = np.abs(np.linalg.det(matrices[:, :3, :3])) if np.isfinite(matrices).all() else np.zeros(1)
+    rest = matrices[int((size >= size.max() / 8).argmax())]
+    if size.max() < 1e-27:
+        raise InputError("The object is scaled to nothing; give it a scale.")
+    return rest, None if still else matrices @ np.linalg.inv(rest)
+
+
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
     """(N,3,3) rotation matrices -> (N,4) unit quaternions w x y z, float32."""
     m = matrices
@@ -66,15 +80,15 @@ def _turned(rotation: np.ndarray, q: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------- writing
 
 
-def slice_at(asset: Asset, frame: float) -> Asset:
+def slice_at(asset: Asset, frame: float, cut: float = VISIBLE) -> Asset:
     """What is visible at a (fractional) frame as an asset that does not change, for tools that know nothing of
     time: in world units, with Z turned to -Y, which those take for up; scales are `soft_scale`. Beyond the
-    clip's ends it is held, as on the timeline. Where nothing is visible (VISIBLE) the least faint Gaussian
+    clip's ends it is held, as on the timeline. Where nothing has the opacity `cut` the least faint Gaussian
     stays, because empty files are refused by many."""
     clip = asset.clip
     held = min(max(frame, clip.frame_start), clip.frame_end)
     xyz, opacity = asset.at(clip.frame_to_time(held))
-    seen = opacity >= VISIBLE
+    seen = opacity >= cut
     seen[opacity.argmax()] |= not seen.any()
     world = xyz[seen] * np.float32(clip.scale) + np.array(clip.translation, np.float32)
     down = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)  # (x, y, z) -> (x, -z, y)
@@ -88,25 +102,30 @@ def slice_at(asset: Asset, frame: float) -> Asset:
     )
 
 
-def write_slice(path: str | Path, asset: Asset, frame: float) -> int:
+def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIBLE) -> int:
     """Writes `slice_at` as a plain 3DGS .ply or as a .splat, by the suffix; whole or not at all. Returns the
     number of Gaussians. Raises InputError."""
     path = Path(path)
     check(asset, path)
     if path.suffix.lower() not in (".ply", ".splat"):
         raise InputError(f"{path}: the name of a slice must end in .ply or .splat; choose one of these.")
-    part = slice_at(asset, frame)
+    part = slice_at(asset, frame, cut)
     with atomic(path) as tmp:
         tmp.write_bytes(_splat_bytes(part) if path.suffix.lower() == ".splat" else _ply_bytes(part, frame))
     return len(part)
 
 
 def write_slices(folder: str | Path, asset: Asset, stem: str) -> int:
-    """Writes a 3DGS .ply for every frame of the clip into a new folder, stem_0001.ply and so on by the frame's
+    """`write_moments` of every frame of the clip."""
+    check(asset, folder)
+    return write_moments(folder, ((frame, asset) for frame in asset.clip.frames), stem)
+
+
+def write_moments(folder: str | Path, moments: Iterable[tuple[int, Asset]], stem: str, cut: float = VISIBLE) -> int:
+    """Writes a 3DGS .ply for each (frame, asset) into a new folder, stem_0001.ply and so on by the frame's
     number; the folder appears whole or not at all. Returns the number of files. Raises InputError, also if the
     folder exists and is not empty."""
-    folder = Path(folder)
-    check(asset, folder)
+    folder, count = Path(folder), 0
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -114,14 +133,15 @@ def write_slices(folder: str | Path, asset: Asset, stem: str) -> int:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as tmp:
             whole = Path(tmp) / "frames"
             whole.mkdir()
-            for frame in asset.clip.frames:
-                (whole / f"{stem}_{frame:04d}.ply").write_bytes(_ply_bytes(slice_at(asset, frame), frame))
+            for frame, asset in moments:
+                count += 1
+                (whole / f"{stem}_{frame:04d}.ply").write_bytes(_ply_bytes(slice_at(asset, frame, cut), frame))
             if folder.is_dir():
                 folder.rmdir()
             shutil.move(whole, folder)
     except OSError as e:
         raise InputError(f"{folder}: it cannot be written ({e.strerror or e}); choose another place.") from None
-    return len(asset.clip.frames)
+    return count
 
 
 def _ply_bytes(part: Asset, frame: float) -> bytes:

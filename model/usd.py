@@ -16,6 +16,7 @@ What is sampled over time
                 the file a third of the size. The exact ones can be had from primvars:gs4d:*.
     widths      one a frame: 0 while the Gaussian is invisible, so that a viewer of mere points shows
                 only what is there.
+    transform   one a frame, where the asset moves as a whole
 `scales` are `Asset.soft_scale`, which has no holes at any resolution; primvars:gs4d:scale are the plain ones.
 Spherical harmonics are sRGB-encoded, as in every 3DGS file; displayColor is linear, as USD wants it.
 """
@@ -35,9 +36,22 @@ import numpy as np
 from ..datagen.sequence import InputError
 from .asset import SH_C0, VISIBLE, Asset, atomic, check, linear_from_srgb, rotation_matrices
 from .usd_check import check_usd
-from .usd_read import ORIGINAL, RECONSTRUCTION, SH, SPLAT, VARIANTS, open_stage, pxr, quiet, read_usd, reading
+from .usd_read import (
+    ORIGINAL,
+    RECONSTRUCTION,
+    SH,
+    SPLAT,
+    VARIANTS,
+    metres_per_unit,
+    open_stage,
+    pxr,
+    quiet,
+    read_moving,
+    read_usd,
+    reading,
+)
 
-__all__ = ["MODES", "SUFFIXES", "check_usd", "read_usd", "write_usd"]
+__all__ = ["MODES", "SUFFIXES", "check_usd", "read_moving", "read_usd", "write_usd"]
 
 ROOT = "/timesplat"
 PRIM = f"{ROOT}/splats"
@@ -58,6 +72,7 @@ def write_usd(
     half: bool = False,
     original: str | Path | None = None,
     original_start: float | None = None,
+    motion: np.ndarray | None = None,
 ) -> None:
     """Writes .usd/.usdc (binary), .usda (text) or .usdz (package); whole or not at all.
 
@@ -72,6 +87,8 @@ def write_usd(
               with `reconstruction` (selected) and `original`, which lies over it. A .usdz takes in the original
               and the files it needs, all from the original's folder; others refer to it by its relative path.
     original_start  its time code at the clip's first frame (default: that frame)
+    motion    (F,4,4) where the asset is taken at each frame of the clip, in the world, from where the clip places it;
+              of the original nothing is moved
     Raises InputError: wrong suffix or mode, bad arrays, the disk, an original that cannot be used."""
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -79,8 +96,10 @@ def write_usd(
     if mode not in MODES:
         raise InputError(f"{mode}: no such mode; choose one of {', '.join(MODES)}.")
     check(asset, path)
+    if motion is not None and not (motion.shape == (len(asset.clip.frames), 4, 4) and np.isfinite(motion).all()):
+        raise InputError(f"{path}: its motion is not a finite matrix for each frame of the clip; export it again.")
     _, Sdf, _, _, UsdUtils, _ = pxr()
-    stage = _stage(asset, mode, half, path, variants=original is not None)
+    stage = _stage(asset, mode, half, path, motion, variants=original is not None)
     with atomic(path) as tmp, tempfile.TemporaryDirectory() as folder, quiet():
         package = Path(folder) / "package.usdz" if path.suffix.lower() == ".usdz" else None
         inner = Path(folder) / "splats.usdc" if package else tmp
@@ -113,9 +132,7 @@ def _add_original(layer, original: Path, shift: float, path: Path, folder: Path)
     roots = [p for p in source.GetPseudoRoot().GetChildren() if p.IsDefined() and not p.IsAbstract()]
     if not prim and len(roots) != 1:
         raise InputError(f"{original}: it has no default prim to refer to; set its defaultPrim.")
-    metres = UsdGeom.GetStageMetersPerUnit(source)
-    if not (np.isfinite(metres) and metres > 0):
-        raise InputError(f"{original}: its metersPerUnit is {metres:g}; set it to a positive number.")
+    metres = metres_per_unit(source, original)
     if path.suffix.lower() == ".usdz":
         if original.suffix.lower() == ".usdz":
             original = _unpacked(original, folder)
@@ -170,7 +187,7 @@ def _unpacked(original: Path, folder: Path) -> Path:
         raise InputError(f"{original}: it is not a whole .usdz ({e}); export it again.") from None
 
 
-def _stage(asset: Asset, mode: str, half: bool, path: Path, variants: bool):
+def _stage(asset: Asset, mode: str, half: bool, path: Path, motion: np.ndarray | None, variants: bool):
     Sdf, Usd, Vt = (pxr()[i] for i in (1, 2, 5))
     clip = asset.clip
     positions, extent = _positions(asset, mode == "frames", path), _extent(asset)
@@ -199,13 +216,18 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path, variants: bool):
                 choice.AddVariant(name)
             choice.SetVariantSelection(RECONSTRUCTION)
             stack.enter_context(choice.GetVariantEditContext())
-        hint = (extent * clip.scale + clip.translation).astype(np.float32)
-        root.CreateAttribute("extentsHint", Sdf.ValueTypeNames.Float3Array, False).Set(Vt.Vec3fArray.FromNumpy(hint))
-        _author(stage, asset, mode, half, positions, extent)
+        hint = extent * clip.scale + clip.translation
+        if motion is not None:  # the corners of the box wherever it goes
+            corners = np.stack(np.meshgrid(*hint.T, [1.0]), -1).reshape(-1, 4)
+            everywhere = (corners @ motion.transpose(0, 2, 1))[..., :3].reshape(-1, 3)
+            hint = np.stack([everywhere.min(0), everywhere.max(0)])
+        hint = Vt.Vec3fArray.FromNumpy(hint.astype(np.float32))
+        root.CreateAttribute("extentsHint", Sdf.ValueTypeNames.Float3Array, False).Set(hint)
+        _author(stage, asset, mode, half, positions, extent, motion)
     return stage
 
 
-def _author(stage, asset: Asset, mode: str, half: bool, positions: dict, extent: np.ndarray) -> None:
+def _author(stage, asset: Asset, mode: str, half: bool, positions: dict, extent: np.ndarray, motion) -> None:
     Gf, Sdf, _, _, _, Vt = pxr()
     clip, T = asset.clip, Sdf.ValueTypeNames
     prim = stage.DefinePrim(PRIM, "Points" if mode == "points" else SPLAT)
@@ -243,8 +265,12 @@ def _author(stage, asset: Asset, mode: str, half: bool, positions: dict, extent:
 
     put("xformOp:translate", T.Double3, Gf.Vec3d(*map(float, clip.translation)))
     put("xformOp:scale", T.Double3, Gf.Vec3d(float(clip.scale)))
-    order = Vt.TokenArray(["xformOp:translate", "xformOp:scale"])
-    put("xformOpOrder", T.TokenArray, order, uniform=True)
+    order = ["xformOp:translate", "xformOp:scale"]
+    if motion is not None:  # outermost; USD's matrices are for row vectors
+        samples = {float(f): Gf.Matrix4d(m.T) for f, m in zip(clip.frames, motion, strict=True)}
+        put("xformOp:transform", T.Matrix4d, samples)
+        order.insert(0, "xformOp:transform")
+    put("xformOpOrder", T.TokenArray, Vt.TokenArray(order), uniform=True)
 
     positions = {c: f3(p) for c, p in positions.items()}
     if len(positions) == 1:

@@ -14,7 +14,7 @@ import numpy as np
 from ..datagen.sequence import InputError
 from .asset import SH_C0, STATIC_SIGMA_T, Asset, Clip, check
 from .formats import MOST, SHARE
-from .slices import placed
+from .slices import apart, placed
 
 SPLAT = "ParticleField3DGaussianSplat"
 SH = "radiance:sphericalHarmonicsCoefficients"
@@ -73,25 +73,39 @@ def select(stage, variant: str) -> bool:
     return bool(sets)
 
 
+def metres_per_unit(stage, path: Path) -> float:
+    """Raises InputError where it is no positive number."""
+    metres = pxr()[3].GetStageMetersPerUnit(stage)
+    if not (np.isfinite(metres) and metres > 0):
+        raise InputError(f"{path}: its metersPerUnit is {metres:g}; set it to a positive number.")
+    return metres
+
+
 def prims(stage):
     """Every prim of the stage, those inside of instances too."""
     return stage.Traverse(pxr()[2].TraverseInstanceProxies())
 
 
 def read_usd(path: str | Path) -> Asset:
+    """`read_moving` without the motion: where it moves as a whole the asset stands where that starts."""
+    return read_moving(path)[0]
+
+
+def read_moving(path: str | Path) -> tuple[Asset, np.ndarray | None]:
     """The asset in a file that `write_usd` wrote (any mode), or in a stage that references one: its transforms,
     upAxis, metersPerUnit and retiming are applied, and the asset's clip leads to metres, Z up. Failing that,
     the splats of another program, without what depends on the direction; where they change over time, as
-    Gaussians that live for one frame each.
+    Gaussians that live for one frame each. And where its prim or what is above it moves over time, that motion:
+    (F,4,4) for each frame of the clip, in the world, from where the clip places the asset (see `apart`).
 
-    Raises InputError: no such file, not USD, no splats or several of them, a transform that is animated or
-    flat, arrays that do not belong together."""
+    Raises InputError: no such file, not USD, no splats or several of them, a transform that is flat, arrays that
+    do not belong together."""
     path = Path(path)
     with reading(path):
         return _read(path)
 
 
-def _read(path: Path) -> Asset:
+def _read(path: Path) -> tuple[Asset, np.ndarray | None]:
     stage = open_stage(path)
     select(stage, RECONSTRUCTION)
     found = [p for p in prims(stage) if p.HasAttribute("primvars:gs4d:mu_t")]
@@ -108,10 +122,10 @@ def _read(path: Path) -> Asset:
 
 
 def _get(path: Path, prim, *names: str, code=None) -> np.ndarray:
-    """The first of the attributes that has a value, as float32, at a time code or else the default time."""
+    """The first of the attributes that has a value, as float32, at a time code or else at the first one."""
     for name in names:
         attribute = prim.GetAttribute(name)
-        value = (attribute.Get() if code is None else attribute.Get(code)) if attribute else None
+        value = attribute.Get(pxr()[2].TimeCode.EarliestTime() if code is None else code) if attribute else None
         if value is not None:
             return np.asarray(value).astype(np.float32)
     raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
@@ -189,27 +203,33 @@ def _read_others(path: Path, stage, prim) -> Asset:
     return Asset(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]}, clip=clip)
 
 
-def _placed(asset: Asset, path: Path, stage, prim) -> Asset:
-    """The asset where the stage has it, in metres, Z up."""
-    Gf, _, Usd, UsdGeom, _, _ = pxr()
+def _placed(asset: Asset, path: Path, stage, prim) -> tuple[Asset, np.ndarray | None]:
+    """The asset where the stage has it, in metres, Z up; and its motion from there."""
+    _, _, Usd, UsdGeom, _, _ = pxr()
     if not prim.IsA(UsdGeom.Xformable):
         version = ".".join(map(str, Usd.GetVersion()[1:]))
         raise InputError(f"{path}: USD {version} does not know the type of {prim.GetPath()}; add fallbackPrimTypes to "
                          "this file, or reference an asset exported as points.")  # fmt: skip
-    above = prim
+    codes, above = [], prim
     while not above.IsPseudoRoot():
         if (x := UsdGeom.Xformable(above)) and x.TransformMightBeTimeVarying():
-            raise InputError(f"{path}: {above.GetPath()} moves over time; only an asset that stands can be read.")
+            codes += x.GetTimeSamples()
         above = above.GetParent()
-    matrix = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
+    if codes and asset.clip.frame_start == asset.clip.frame_end:  # the motion alone has a length
+        asset = replace(asset, clip=_clip(path, stage, min(codes), max(codes), asset.clip.pixel))
+    outer = np.diag([*[metres_per_unit(stage, path)] * 3, 1.0])
     if UsdGeom.GetStageUpAxis(stage) == "Y":
-        matrix *= Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(1, 0, 0), 90))
-    matrix *= Gf.Matrix4d().SetScale(UsdGeom.GetStageMetersPerUnit(stage))
-    matrix = np.array(matrix).T
-    scale = float(matrix[0, 0])
-    if scale > 0 and np.abs(matrix[:3, :3] - scale * np.eye(3)).max() < 1e-6 * scale:
-        return replace(asset, clip=replace(asset.clip, scale=scale, translation=tuple(map(float, matrix[:3, 3]))))
+        outer = outer @ [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
+    cache, matrices = UsdGeom.XformCache(), []
+    for frame in asset.clip.frames if codes else [asset.clip.frame_start]:
+        cache.SetTime(frame)
+        matrices.append(outer @ np.array(cache.GetLocalToWorldTransform(prim)).T)
     try:
-        return placed(asset, matrix)
+        matrix, motion = apart(np.stack(matrices))
+        scale = float(matrix[0, 0])
+        if scale > 0 and np.abs(matrix[:3, :3] - scale * np.eye(3)).max() < 1e-6 * scale:
+            clip = replace(asset.clip, scale=scale, translation=tuple(map(float, matrix[:3, 3])))
+            return replace(asset, clip=clip), motion
+        return placed(asset, matrix), motion
     except InputError:
         raise InputError(f"{path}: {prim.GetPath()} is scaled to nothing; give it a scale.") from None

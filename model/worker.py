@@ -14,9 +14,11 @@ to do; null or "" is the same as leaving a key out:
         asset       .ply to read                    out         .usd* to write
         mode        splats | points | frames        half        true or false
         original    .usd* of the object, for a variant beside the reconstruction
+        motion      .npy with where the asset is taken at each frame (see write_usd)
         done: out, complaints (the validator's, a list of sentences), bytes
     import          the other way round             (never imports torch)
         source      .usd* to read                   asset       .ply to write
+        motion      .npy to write where the asset moves as a whole (see read_moving)
         done: asset, gaussians
     selftest        does this interpreter reconstruct?
         device, checkpoint
@@ -44,6 +46,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TextIO
 
+import numpy as np
+
 from ..datagen.sequence import InputError, read_sequence
 
 _KINDS = {"text": str, "number": (int, float), "true or false": bool, "list": list}
@@ -51,7 +55,7 @@ _KEYS = {
     "task": "text", "watch": "true or false", "sequence": "text", "asset": "text", "method": "text",
     "device": "text", "checkpoint": "text", "indices": "list", "refine": "number", "budget": "text",
     "max_loss": "number", "out": "text", "mode": "text", "half": "true or false", "source": "text",
-    "original": "text",
+    "original": "text", "motion": "text",
 }  # fmt: skip
 _NEEDED = {"reconstruct": ("sequence", "asset"), "export": ("asset", "out"), "import": ("source", "asset")}
 _NEEDED |= {"selftest": ()}
@@ -72,7 +76,7 @@ def main(argv: list[str]) -> int:
         request = _request(argv)
         task = request.setdefault("task", "reconstruct")
         if request.get("watch"):
-            threading.Thread(target=_leave_when_stdin_closes, daemon=True).start()
+            threading.Thread(target=_leave_when_closed, args=[_take_stdin()], daemon=True).start()
         do = {"reconstruct": _reconstruct, "export": _export, "import": _import, "selftest": _selftest}[task]
         say("done", **do(request, progress), seconds=round(time.monotonic() - start, 3))
     except InputError as e:
@@ -138,8 +142,11 @@ def _reconstruct(request: dict, progress) -> dict:
 
 
 def _limit_memory() -> None:
-    """To half of the machine's, where that can be: a damaged USD file may claim to need any amount."""
-    with contextlib.suppress(ImportError, AttributeError, OSError, ValueError):
+    """To half of the machine's, on Linux: a damaged USD file may claim to need any amount. (Windows has no such limit,
+    and on macOS an address space is larger than any memory from the start.)"""
+    if sys.platform != "linux":
+        return
+    with contextlib.suppress(OSError, ValueError):
         import resource
 
         half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
@@ -161,20 +168,30 @@ def _export(request: dict, progress) -> dict:
         mode=request.get("mode", "splats"),
         half=request.get("half", False),
         original=request.get("original"),
+        motion=_matrices(request["motion"]) if "motion" in request else None,
     )
     progress(0.7, f"checking {out.name}")
     return {"out": request["out"], "complaints": check_usd(out), "bytes": out.stat().st_size}
 
 
+def _matrices(path: str) -> np.ndarray:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False), float)
+    except (OSError, ValueError, EOFError) as e:
+        raise InputError(f"{path}: the motion cannot be read ({e}); export again.") from None
+
+
 def _import(request: dict, progress) -> dict:
     _limit_memory()
     from .asset import write_ply
-    from .usd import read_usd
+    from .usd import read_moving
 
     progress(0.0, f"reading {Path(request['source']).name}")
-    asset = read_usd(request["source"])
+    asset, motion = read_moving(request["source"])
     progress(0.7, "writing the asset")
     write_ply(request["asset"], asset)
+    if motion is not None and "motion" in request:
+        np.save(request["motion"], motion)
     return {"asset": request["asset"], "gaussians": len(asset)}
 
 
@@ -190,7 +207,7 @@ def _request(argv: list[str]) -> dict:
     """The request without keys that are null or empty; raises InputError."""
     source = argv[0] if argv else "standard input"
     try:
-        text = Path(argv[0]).read_text() if argv else sys.stdin.readline()
+        text = Path(argv[0]).read_text(encoding="utf-8") if argv else sys.stdin.readline()
         request = json.loads(text)
         if not isinstance(request, dict):
             raise ValueError("it is not an object")
@@ -222,8 +239,17 @@ def _take_stdout() -> TextIO:
     return ours
 
 
-def _leave_when_stdin_closes() -> None:
-    while sys.stdin.readline():
+def _take_stdin() -> int:
+    """A descriptor of our own of standard input, in whose place there is nothing to read from now on. On Windows a
+    program hangs at its start if it inherits a pipe that is being read (cpython #78961)."""
+    ours, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    return ours
+
+
+def _leave_when_closed(pipe: int) -> None:
+    while os.read(pipe, 1 << 16):
         pass
     os._exit(3)
 

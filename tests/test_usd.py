@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, linear_from_srgb, rotation_matrices
-from timesplat.model.usd import BOX, PRIM, check_usd, read_usd, write_usd
+from timesplat.model.usd import BOX, PRIM, check_usd, read_moving, read_usd, write_usd
 from timesplat.model.usd_read import SPLAT
 
 CLIP = Clip(30.0, 10, 33, 2.0, (1.0, 2.0, 3.0), pixel=0.01)
@@ -392,8 +392,10 @@ def test_moving_splats_of_another_program_live_for_a_frame_each(tmp_path):
         (lambda stage, prim: prim.GetAttribute("opacities").Set([1, 1]), "opacity is not a float32 array"),
         (lambda stage, prim: UsdGeom.Xformable(prim).AddScaleOp().Set((0, 1, 1)), "/scan is scaled to nothing"),
         (lambda stage, prim: UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, 1), 3), None),
-        (lambda stage, prim: [UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, f), f) for f in (1,)]
-         and [prim.GetAttribute("xformOp:translate").Set((0, 1, f), f) for f in (2, 3)], "/scan moves over time"),
+        (lambda stage, prim: [x.Set((0, 1, f), f) for x in [UsdGeom.Xformable(prim).AddTranslateOp()]
+                              for f in (2, 3e6)], "its frames run from 2 to 3e+06"),
+        (lambda stage, prim: UsdGeom.SetStageMetersPerUnit(stage, -1), "its metersPerUnit is -1"),
+        (lambda stage, prim: UsdGeom.SetStageMetersPerUnit(stage, float("nan")), "its metersPerUnit is nan"),
         (lambda stage, prim: [prim.GetAttribute("positions").Set([(0, 0, 0)] * 3, f) for f in (0, 1e9)],
          "its frames run from 0 to 1e+09"),
         (lambda stage, prim: stage.DefinePrim("/scan2", SPLAT), "holds 2 assets (/scan, /scan2)"),
@@ -410,6 +412,71 @@ def test_what_cannot_be_read_is_told_in_a_sentence(tmp_path, edit, word):
     with pytest.raises(InputError) as e:
         read_usd(tmp_path / "a.usda")
     assert word in str(e.value) and "a.usda" in str(e.value) and "\n" not in str(e.value)
+
+
+def turned(angle: float, *, scale=1.0, shear=0.0) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, shear, angle], [s, c, 0, 2 * angle], [0, 0, scale, -1], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdz"])
+@pytest.mark.parametrize("mode", ["splats", "points"])
+def test_an_asset_that_moves_as_a_whole(tmp_path, suffix, mode):
+    """It is at each frame where it was said to be; it is read back where that starts, with the motion from there."""
+    asset, path = make(), tmp_path / f"a{suffix}"
+    motion = np.stack([turned(f / 7, scale=1 + f / 30, shear=f / 50) for f in range(24)])
+    write_usd(path, asset, mode=mode, motion=motion)
+    assert check_usd(path) == []
+    stage, prim = splats(path)
+    own = np.array([[2, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1.0]])
+    low, high = np.array(stage.GetDefaultPrim().GetAttribute("extentsHint").Get())
+    for f, moved in zip(asset.clip.frames, motion, strict=True):
+        matrix = np.array(UsdGeom.XformCache(f).GetLocalToWorldTransform(prim)).T
+        np.testing.assert_allclose(matrix, moved @ own, atol=1e-12)
+        positions, opacity = asset.at(asset.frame_to_time(f))
+        world = (np.c_[positions, np.ones(len(positions))] @ matrix.T)[opacity > 0.05, :3]
+        assert ((world > low) & (world < high)).all()
+    assert (high - low).max() < 25  # metres
+    back, again = read_moving(path)
+    np.testing.assert_allclose(back.clip.translation, (motion[0] @ own)[:3, 3])
+    np.testing.assert_allclose(again, motion @ np.linalg.inv(motion[0]), atol=1e-9)
+    assert read_usd(path).clip == back.clip
+    np.testing.assert_allclose(back.xyz, asset.xyz, atol=1e-6)  # motion[0] is a mere translation
+    write_usd(tmp_path / "b.usdc", back, motion=again)
+    stage, prim = splats(tmp_path / "b.usdc")
+    matrix = np.array(UsdGeom.XformCache(33).GetLocalToWorldTransform(prim)).T
+    np.testing.assert_allclose(matrix, motion[-1] @ own, atol=1e-9)
+    for wrong in (motion[:5], motion * np.nan):
+        with pytest.raises(InputError, match="its motion is not a finite matrix for each frame"):
+            write_usd(tmp_path / "c.usdc", asset, motion=wrong)
+
+
+def test_splats_of_another_program_that_move_as_a_whole(tmp_path):
+    """They grow out of nothing while their parent moves: they rest where they are half as large."""
+    at, _ = others(tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = UsdGeom.Xformable(stage.GetPrimAtPath("/scan"))
+    shift, size = prim.AddTranslateOp(), prim.AddScaleOp()
+    for f in range(5):
+        shift.Set((f, 0, 0), 20 + f)
+        size.Set((f / 4,) * 3, 20 + f)
+    stage.Save()
+    asset, motion = read_moving(tmp_path / "a.usda")
+    assert asset.clip.frames == range(20, 25) and len(motion) == 5
+    placed = np.c_[asset.xyz * asset.clip.scale + asset.clip.translation, np.ones(3)]
+    for f in range(5):
+        x, y, z = (at[None] * f / 4 + [f, 0, 0]).T * 0.1
+        np.testing.assert_allclose((placed @ motion[f].T)[:, :3], np.stack([x, -z, y], 1), atol=1e-6)
+    for f in range(5):  # samples that are all the same are no motion
+        shift.Set((3, 0, 0), 20 + f)
+        size.Set((1,) * 3, 20 + f)
+    stage.Save()
+    asset, motion = read_moving(tmp_path / "a.usda")
+    x, y, z = (at[None] + [3, 0, 0]).T * 0.1
+    np.testing.assert_allclose(
+        asset.xyz * asset.clip.scale + asset.clip.translation, np.stack([x, -z, y], 1), atol=1e-6
+    )
+    assert motion is None
 
 
 def test_files_from_before_gs4d_time_are_read(tmp_path):
