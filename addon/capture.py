@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What renders the pictures, in a Blender of its own (`beside`). The request:
-objects    names of what is captured            cameras    names of cameras, or [] for those of `rig`
+objects    full names of what is captured       cameras    full names of cameras, or [] for those of `rig`
 rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
 frames     scene frames                         in_turn    one camera a frame, instead of all of them
 size, samples, passes, lighting                 as `datagen.capture.capture` has them
@@ -16,8 +16,8 @@ import numpy as np
 
 from ..datagen import rigs
 from ..datagen.capture import capture
-from ..datagen.scene import normalisation, versions
-from ..datagen.sequence import Normalisation
+from ..datagen.scene import normalisation, simulate, versions
+from ..datagen.sequence import InputError, Normalisation
 from . import beside, process
 
 
@@ -28,22 +28,41 @@ def shoot(request: dict, folder: Path) -> process.Child:
 
 def camera_shots(scene, cameras: list, frames: list[int], norm: Normalisation, in_turn: bool) -> list[rigs.Shot]:
     """What the scene's own cameras see at each frame (or one of them in turn), in normalised space: perspective,
-    square, without lens shift."""
+    square. What is hidden in the viewport or in an excluded collection is not evaluated: it is linked and shown."""
+    for ob in cameras:
+        if scene.collection not in ob.users_collection:
+            scene.collection.objects.link(ob)
+        ob.hide_viewport = False
+        ob.hide_set(False)
     shots = []
     for i, frame in enumerate(frames):
         scene.frame_set(frame)
         for ob in [cameras[i % len(cameras)]] if in_turn else cameras:
-            c2w = np.array(ob.matrix_world.normalized())
-            fov = float(np.degrees(ob.data.angle))
-            shots.append(rigs.Shot(i, ob.name, "scene", norm.from_world(c2w), fov))
+            fov, shift = float(np.degrees(ob.data.angle)), (ob.data.shift_x, ob.data.shift_y)
+            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(_rigid(ob)), fov, shift))
     return shots
+
+
+def _rigid(ob) -> np.ndarray:
+    """(4,4) float64: where a camera stands, which way it looks and which way is up, without scale, mirroring or shear.
+    Raises InputError where its scale leaves no direction."""
+    c2w = np.array(ob.matrix_world)
+    back, up = c2w[:3, 2], c2w[:3, 1]
+    right = np.cross(up, back)
+    lengths = [np.linalg.norm(v) for v in (back, up, right)]
+    if not min(lengths) > 1e-6 * max(lengths[:2]) ** 2:
+        raise InputError(f"{ob.name}: a camera of scale 0 looks nowhere; apply another scale or unselect it.")
+    c2w[:3, 0], c2w[:3, 2] = right / lengths[2], back / lengths[0]
+    c2w[:3, 1] = np.cross(c2w[:3, 2], c2w[:3, 0])
+    return c2w
 
 
 def _capture(request: dict, progress) -> dict:
     scene, frames = bpy.context.scene, request["frames"]
-    objects = [scene.objects[name] for name in request["objects"]]
-    cameras = [scene.objects[name] for name in request["cameras"]]
+    named = {ob.name_full: ob for ob in scene.objects}  # names alone are not unique: two libraries may use one
+    objects, cameras = ([named[n] for n in request[key]] for key in ("objects", "cameras"))
     progress(0.02, "measuring the object")
+    simulate(frames[-1])
     norm, aabb = normalisation(frames, objects, name=scene.name)
     numbers, seed, rig = range(len(frames)), request.get("seed", 0), request.get("rig")
     if cameras and not rig:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import bpy
 from bpy.props import StringProperty
+from mathutils import Matrix
 
 from ..datagen.sequence import InputError
 from ..model.asset import read_ply, write_ply
@@ -32,6 +33,7 @@ class TIMESPLAT_OT_reconstruct(settings.Settings, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
+        cls.poll_message_set("Reconstruct works in Object Mode; leave the mode that you are in.")
         return context.mode == "OBJECT"
 
     def invoke(self, context, event):
@@ -63,8 +65,8 @@ def request(chosen, context) -> dict:
         if ob.data.type != "PERSP":
             raise InputError(f"{ob.name}: the camera is not a perspective one; change its type or unselect it.")
     return {
-        "objects": [o.name for o in settings.objects(chosen, context)],
-        "cameras": [o.name for o in cameras],
+        "objects": [o.name_full for o in settings.objects(chosen, context)],
+        "cameras": [o.name_full for o in cameras],
         "frames": list(settings.frames(chosen, context.scene)),
         "in_turn": chosen.in_turn,
         "size": chosen.size,
@@ -104,17 +106,21 @@ def start(chosen, context) -> jobs.Job:
         "device": preferences.device(context),
         "checkpoint": checkpoint or preferences.checkpoint(context),
     }
-    names = [n for n in shot["objects"] if context.scene.objects[n].type not in ("LIGHT", "CAMERA")]
+    captured = [o for o in settings.objects(chosen, context) if o.type not in ("LIGHT", "CAMERA")]
+    known = {o.session_uid for o in captured}  # names may change while it runs
+    roots = [o for o in captured if o.parent not in captured]
+    root, there = (roots[0].session_uid, _pose(roots[0]).inverted(None)) if len(roots) == 1 else (0, None)
 
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
         if not (asked["budget"] or asked["refine"]):
             settings.learn_number(asked["method"], len(asset), pixels)
         ob = display.add_asset(asset, "Timesplat", look=look, context=bpy.context)
-        ob["timesplat_source"], ob["timesplat_lighting"] = names, shot["lighting"]
-        roots = {n: o for n in names if (o := bpy.context.scene.objects.get(n)) and not o.parent}
-        if len(roots) == 1:
-            display.follow(ob, next(iter(roots.values())))
+        originals = {o.session_uid: o for o in bpy.context.scene.objects if o.session_uid in known}
+        ob["timesplat_source"] = [o.name for o in originals.values()]
+        ob["timesplat_lighting"] = shot["lighting"]
+        if there and root in originals and display.follow(ob, originals[root]):
+            ob.matrix_parent_inverse = there  # it may have been moved since
         said = f"{len(asset)} Gaussians in {time.monotonic() - begun:.0f} s"
         if output:
             try:
@@ -127,6 +133,11 @@ def start(chosen, context) -> jobs.Job:
     return jobs.start(
         "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=context.scene.name
     )
+
+
+def _pose(ob) -> Matrix:
+    """Where an object stands by its own and its parents' settings: of a hidden one Blender evaluates nothing."""
+    return (_pose(ob.parent) @ ob.matrix_parent_inverse if ob.parent else Matrix()) @ ob.matrix_basis
 
 
 def _output(path: str) -> Path | None:

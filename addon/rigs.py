@@ -73,7 +73,7 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
         try:
             frames = settings.frames(chosen, scene)
             some = sorted({frames[round(i * (len(frames) - 1) / 11)] for i in range(12)})
-            norm, _ = normalisation(some, settings.objects(chosen, context), name=scene.name)
+            norm, _ = normalisation(some, settings.objects(chosen, context), name=scene.name, rendered=False)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}

@@ -116,14 +116,14 @@ def objects(settings, context) -> list:
     scene = context.scene
     shown = [o for o in shown_objects(scene, context.view_layer) if not o.get("timesplat")]
     if settings.source == "SELECTED":
-        family = {o.name for s in context.view_layer.objects.selected for o in (s, *s.children_recursive)}
-        shown = [o for o in shown if o.name in family or o.type == "LIGHT"]
+        family = {o for s in context.view_layer.objects.selected for o in (s, *s.children_recursive)}
+        shown = [o for o in shown if o in family or o.type == "LIGHT"]
     elif settings.source == "COLLECTION":
         collection = bpy.data.collections.get(settings.collection)
         if collection is None:
             raise InputError(f"{settings.collection or 'Collection'}: no such collection; choose one.")
-        inside = {o.name for o in collection.all_objects}
-        shown = [o for o in shown if o.name in inside or o.type == "LIGHT"]
+        inside = set(collection.all_objects)
+        shown = [o for o in shown if o in inside or o.type == "LIGHT"]
     if not any(o.type in SHAPES or o.instance_type == "COLLECTION" for o in shown):
         raise InputError("There is nothing to capture: no mesh is chosen that renders show; choose another Object.")
     return shown

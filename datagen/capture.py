@@ -113,7 +113,7 @@ def capture(
             if lighting:
                 even_light(stage, made)
             cameras = _Cameras(stage, made, normalisation)
-            done = 0
+            done, slugs = 0, _slugs(shots)
             for frame, group in groupby(order, key=lambda i: shots[i].frame):
                 stage.frame_set(frames[frame])
                 if engine == "CYCLES":
@@ -121,7 +121,7 @@ def capture(
                 cameras.place([taken[i] for i in group])
                 for file in cameras.render(tmp):
                     view = seq.views[done]
-                    name = f"{_plain(view.rig)}_{_plain(view.camera)}_{view.frame:04d}"
+                    name = f"{slugs[view.rig, view.camera]}_{view.frame:04d}"
                     try:
                         channels = read_multilayer(file)
                     except (ValueError, OSError, struct.error, IndexError, KeyError):
@@ -183,12 +183,24 @@ def _per_step(passes: Passes, frames: list[int], i: int) -> None:
 
 
 def _view(shot: Shot, width: int, height: int) -> View:
-    focal = focal_from_fov(shot.fov, max(width, height))
-    return View(shot.frame, shot.camera, shot.rig, shot.c2w, focal, focal, width / 2, height / 2)
+    side = max(width, height)
+    focal = focal_from_fov(shot.fov, side)
+    cx, cy = width / 2 - shot.shift[0] * side, height / 2 + shot.shift[1] * side
+    return View(shot.frame, shot.camera, shot.rig, shot.c2w, focal, focal, cx, cy)
 
 
-def _plain(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9-]+", "-", text) or "0"
+def _slugs(shots: list[Shot]) -> dict[tuple[str, str], str]:
+    """(rig, camera) -> a file name of its own for each, of plain letters, also where capitals count for nothing."""
+    slugs: dict[tuple[str, str], str] = {}
+    taken = set()
+    for who in dict.fromkeys((s.rig, s.camera) for s in shots):
+        slug = base = "_".join(re.sub(r"[^A-Za-z0-9-]+", "-", text) or "0" for text in who)
+        n = 2
+        while slug.lower() in taken:
+            slug, n = f"{base}-{n}", n + 1
+        taken.add(slug.lower())
+        slugs[who] = slug
+    return slugs
 
 
 # ---------------------------------------------------------------- the borrowed scene
@@ -219,6 +231,9 @@ def render_settings(stage, width, height, samples, passes, engine, device, threa
         cycles = stage.cycles
         cycles.device, cycles.samples, cycles.time_limit = device, samples, 0
         cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_animated_seed = False
+        cycles.sample_offset = 0
+        if hasattr(cycles, "use_sample_subset"):  # Blender 5
+            cycles.use_sample_subset = False
         cycles.film_exposure, cycles.film_transparent_glass = 1, False
         cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
     else:
@@ -227,7 +242,7 @@ def render_settings(stage, width, height, samples, passes, engine, device, threa
         setattr(layer, name, False)
     layer.use_pass_combined = True
     layer.use_pass_z = layer.use_pass_vector = passes
-    layer.use = True
+    layer.use, layer.samples = True, 0
     image = render.image_settings
     if hasattr(image, "media_type"):  # Blender 5: this comes before the format
         image.media_type = "MULTI_LAYER_IMAGE"
@@ -280,6 +295,7 @@ class _Cameras:
         for ob, shot in zip(self.objects, shots, strict=False):
             ob.matrix_world = Matrix(self.normalisation.to_world(shot.c2w).tolist())
             ob.data.angle = math.radians(shot.fov)
+            ob.data.shift_x, ob.data.shift_y = shot.shift
         self.stage.camera = self.objects[0]
         self.count = len(shots)
         render = self.stage.render

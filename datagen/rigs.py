@@ -22,13 +22,15 @@ CANONICAL = {"front": 0.0, "left": 90.0, "back": 180.0, "right": 270.0}  # camer
 
 @dataclass
 class Shot:
-    """One picture to take: a camera at a frame. `fov` is the full field of view of the longer image side."""
+    """One picture to take: a camera at a frame. `fov` is the full field of view of the longer image side, `shift`
+    how far the picture is moved right and up in its plane, in parts of that side."""
 
     frame: int
     camera: str
     rig: str
     c2w: np.ndarray  # (4,4) float64, OpenGL axes, normalised space
     fov: float = FOV  # degrees
+    shift: tuple[float, float] = (0.0, 0.0)
 
 
 def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import bpy
 import numpy as np
@@ -153,28 +154,32 @@ def _check_textures(path: Path) -> list[str]:
 
 # ---------------------------------------------------------------- lending the scene
 
+_LEFT_OUT = ("CAMERA", "GPENCIL", "GREASEPENCIL")
+
 
 def shown_objects(scene, view_layer) -> list:
     """The objects of the scene that a render of the view layer could show: those in a collection that is
     neither excluded nor hidden from renders. (An object's own hide_render may be animated; it is kept.)"""
-    shown = {}
+    shown = set()
 
     def walk(layer, hidden):
         hidden = hidden or layer.exclude or layer.collection.hide_render
         if not hidden:
-            shown.update((ob.name, ob) for ob in layer.collection.objects)
+            shown.update(layer.collection.objects)
         for child in layer.children:
             walk(child, hidden)
 
     walk(view_layer.layer_collection, False)
-    return [ob for ob in scene.objects if ob.name in shown]
+    return [ob for ob in scene.objects if ob in shown]
 
 
 @contextlib.contextmanager
 def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
     """A throw-away copy of the open scene with one view layer, to change and to step through at will.
 
-    objects: what it contains; None = all that renders show; lights False leaves light objects out.
+    objects: what it contains; None = all that renders show; lights False leaves light objects out. Cameras are left
+    out, and so is Grease Pencil, which has no depth. Without a window the copy stands in for the scene wherever this
+    is referred to: a driver that reads the scene's frame would stand still otherwise.
     On leaving, the copy is gone and the scene's own frame is evaluated again.
     """
     source, layer = bpy.context.scene, bpy.context.view_layer
@@ -188,12 +193,54 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
         for ob in list(stage.collection.objects):
             stage.collection.objects.unlink(ob)
         for ob in keep:
-            if ob.type != "CAMERA" and (lights or ob.type != "LIGHT"):
+            if ob.type not in _LEFT_OUT and (lights or ob.type != "LIGHT"):
                 stage.collection.objects.link(ob)
+        stage.timeline_markers.clear()  # those with a camera would switch to it
+        stage.background_set = None
+        if bpy.app.background:
+            source.user_remap(stage)
         yield stage
     finally:
+        if bpy.app.background:
+            stage.user_remap(source)
         bpy.data.scenes.remove(stage)
         source.frame_set(source.frame_current, subframe=source.frame_subframe)
+
+
+def simulate(last: int) -> None:
+    """Plays the open scene up to scene frame `last` where something is simulated and not baked: physics goes from frame
+    to frame and stands still where one jumps. Rigid bodies become keyframes, for they move in no copy of their scene;
+    call it only where the session is thrown away."""
+    scene = bpy.context.scene
+    caches = []
+    for ob in bpy.data.objects:
+        caches += [m.point_cache for m in ob.modifiers if m.type in ("CLOTH", "SOFT_BODY")]
+        caches += [p.point_cache for p in ob.particle_systems]
+    first = [c.frame_start for c in caches if not c.is_baked]
+    if any(n.bl_idname == "GeometryNodeSimulationOutput" for g in bpy.data.node_groups for n in g.nodes):
+        first.append(scene.frame_start)
+    for frame in range(min(first), last + 1) if first else ():
+        scene.frame_set(frame)
+    if scene.rigidbody_world:
+        _key_rigid_bodies(scene, last)
+
+
+def _key_rigid_bodies(scene, last: int) -> None:
+    frames = range(scene.rigidbody_world.point_cache.frame_start, last + 2)  # motion vectors look one ahead
+    bodies = [ob for ob in scene.objects if ob.rigid_body and ob.rigid_body.type == "ACTIVE"]
+    poses = []
+    for frame in frames:
+        scene.frame_set(frame)
+        poses.append([ob.matrix_world.copy() for ob in bodies])
+    bpy.ops.rigidbody.world_remove()
+    for ob in bodies:
+        ob.rotation_mode = "QUATERNION"
+    for frame, there in zip(frames, poses, strict=True):
+        scene.frame_set(frame)
+        for ob, pose in zip(bodies, there, strict=True):
+            ob.matrix_world = pose
+            ob.keyframe_insert("location", frame=frame)
+            ob.keyframe_insert("rotation_quaternion", frame=frame)
 
 
 # ---------------------------------------------------------------- measuring
@@ -201,37 +248,92 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
 
 def vertices(mesh) -> np.ndarray:
     """(N,3) float64 local coordinates of a mesh."""
-    flat = np.empty(len(mesh.vertices) * 3, np.float32)
-    mesh.vertices.foreach_get("co", flat)
+    return _floats(mesh.vertices, "co")
+
+
+def _floats(items, name: str) -> np.ndarray:
+    flat = np.empty(len(items) * 3, np.float32)
+    items.foreach_get(name, flat)
     return flat.reshape(-1, 3).astype(np.float64)
 
 
-def world_vertices(stage) -> list[tuple[str, np.ndarray]]:
-    """(object name, (N,3) world coordinates) of each mesh instance shown by the evaluated scene `stage`."""
+def _points(ob) -> np.ndarray:
+    """(N,3) local coordinates of what an evaluated object shows; none for a kind that shows nothing."""
+    if ob.type == "MESH":
+        return vertices(ob.data)
+    if ob.type in ("CURVES", "POINTCLOUD") and (position := ob.data.attributes.get("position")):
+        return _floats(position.data, "vector")
+    return np.array(ob.bound_box if ob.type == "VOLUME" else [], float).reshape(-1, 3)
+
+
+def world_vertices(depsgraph) -> list[tuple[str, np.ndarray]]:
+    """(object name, (N,3) world coordinates) of each instance of a shape that an evaluated scene shows to cameras."""
     found = []
-    for instance in stage.view_layers[0].depsgraph.object_instances:
-        ob = instance.object
-        hidden = ob.hide_render or (instance.parent and instance.parent.hide_render)
-        if ob.type != "MESH" or hidden or not instance.show_self or not len(ob.data.vertices):
+    for instance in depsgraph.object_instances:
+        ob, top = instance.object, instance.parent or instance.object
+        if top.hide_render or not (instance.show_self and ob.visible_camera and top.visible_camera):
             continue
-        matrix = np.array(instance.matrix_world)
-        found.append((ob.name, vertices(ob.data) @ matrix[:3, :3].T + matrix[:3, 3]))
+        points, matrix = _points(ob), np.array(instance.matrix_world)
+        if len(points):
+            found.append((ob.name, points @ matrix[:3, :3].T + matrix[:3, 3]))
     return found
 
 
-def normalisation(
-    frames: list[int], objects: list | None = None, name: str = "scene"
-) -> tuple[Normalisation, np.ndarray]:
-    """Bounds of the visible meshes of the open scene over all scene frames given: the Normalisation (box
-    centre, longest half-side) and the box itself, (2,3), in normalised units. Raises InputError (with `name`)
-    where nothing is visible, a vertex is not finite or too far out, or everything is one point."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    with borrowed(objects) as stage:
+class _Ruler(bpy.types.RenderEngine):
+    """Measures instead of rendering: only a render engine is shown what renders show, with their modifiers, levels
+    and visibility."""
+
+    bl_idname, bl_label = "TIMESPLAT_RULER", "Timesplat"
+    found: ClassVar[list] = []
+
+    def render(self, depsgraph) -> None:
+        try:
+            _Ruler.found.append(world_vertices(depsgraph))
+        except Exception as e:  # Blender would print it and go on
+            _Ruler.found.append(e)
+
+
+def measured(frames: list[int], objects: list | None = None, *, rendered: bool = True) -> Iterator[list]:
+    """`world_vertices` at each of the scene frames, as renders show them, which replaces the session's render result;
+    rendered False: as the viewport does."""
+    with borrowed(objects) as stage, contextlib.ExitStack() as stack:
+        render, layer = stage.render, stage.view_layers[0]
+        if rendered:
+            bpy.utils.register_class(_Ruler)
+            stack.callback(bpy.utils.unregister_class, _Ruler)
+            stage.camera = bpy.data.objects.new("timesplat", bpy.data.cameras.new("timesplat"))  # one must be there
+            stack.callback(bpy.data.batch_remove, [stage.camera.data, stage.camera])
+            render.engine, render.resolution_x, render.resolution_y = _Ruler.bl_idname, 8, 8
+            render.use_compositing = render.use_sequencer = render.use_multiview = render.use_freestyle = False
+            render.use_stamp, layer.use = False, True
+        else:
+            for ob in layer.objects:
+                ob.hide_set(False, view_layer=layer)
         for frame in dict.fromkeys(frames):
             stage.frame_set(frame)
-            for part, points in world_vertices(stage):
-                check_vertices(name, part, points)
-                low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
+            if not rendered:
+                yield world_vertices(layer.depsgraph)
+                continue
+            with bpy.context.temp_override(scene=stage):
+                bpy.ops.render.render()
+            found = _Ruler.found.pop()
+            if isinstance(found, Exception):
+                raise found
+            yield found
+
+
+def normalisation(
+    frames: list[int], objects: list | None = None, name: str = "scene", *, rendered: bool = True
+) -> tuple[Normalisation, np.ndarray]:
+    """Bounds of the visible shapes of the open scene over all scene frames given: the Normalisation (box
+    centre, longest half-side) and the box itself, (2,3), in normalised units; `rendered` as `measured` has it.
+    Raises InputError (with `name`) where nothing is visible, a vertex is not finite or too far out, or everything
+    is one point."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for found in measured(frames, objects, rendered=rendered):
+        for part, points in found:
+            check_vertices(name, part, points)
+            low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
     if not np.isfinite(low).all():
         raise InputError(f"{name}: no mesh is visible in frames {frames[0]} to {frames[-1]}; choose others.")
     centre, scale = (low + high) / 2, float((high - low).max() / 2)
@@ -246,11 +348,9 @@ def motion(frames: list[int], objects: list | None = None) -> float:
     of the frames, in units of the longest half-side of the box over those frames; 0 for what holds still.
     Meshes whose vertex count changes are left out."""
     tracks: dict[int, list[np.ndarray]] = {}
-    with borrowed(objects) as stage:
-        for frame in dict.fromkeys(frames):
-            stage.frame_set(frame)
-            for i, (_, points) in enumerate(world_vertices(stage)):
-                tracks.setdefault(i, []).append(points)
+    for found in measured(frames, objects):
+        for i, (_, points) in enumerate(found):
+            tracks.setdefault(i, []).append(points)
     whole = [t for t in tracks.values() if all(len(p) == len(t[0]) for p in t)]
     if not whole:
         return 0.0

@@ -68,13 +68,8 @@ def two_clips(tmp_path_factory):
 
 def boxes(frames):
     """(F,2,3) bounds of all that is visible, at each frame."""
-    found = []
-    with scene.borrowed() as stage:
-        for f in frames:
-            stage.frame_set(f)
-            points = np.concatenate([p for _, p in scene.world_vertices(stage)])
-            found.append([points.min(0), points.max(0)])
-    return np.round(found, 3)
+    parts = [np.concatenate([p for _, p in shown]) for shown in scene.measured(frames)]
+    return np.round([[p.min(0), p.max(0)] for p in parts], 3)
 
 
 def test_tracks_named_alike_are_one_clip(two_clips):
