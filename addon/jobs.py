@@ -23,7 +23,7 @@ import bpy
 from bpy.app.handlers import persistent
 from bpy.props import IntProperty
 
-from ..datagen.sequence import InputError
+from ..datagen.sequence import WINDOWS, InputError
 from . import process
 from .preferences import user_folder
 
@@ -204,16 +204,30 @@ def _redraw(job: Job) -> None:
 
 
 def sweep() -> None:
-    """Removes what Blenders that are gone left in the folder of runs."""
+    """Removes from the folder of runs what Blenders that are gone left, and what ended Jobs of this one could not
+    remove because something still held it."""
+    kept = [job.folder for job in JOBS if job.state in ("running", "waiting")]
     for folder in user_folder("runs").glob("run-*-*"):
         with contextlib.suppress(ValueError):
-            if not _alive(int(folder.name.split("-")[1])):
+            pid = int(folder.name.split("-")[1])
+            if not (folder in kept if pid == os.getpid() else _alive(pid)):
                 shutil.rmtree(folder, ignore_errors=True)
 
 
 def _alive(pid: int) -> bool:
-    if os.name != "posix":
-        return pid == os.getpid()  # files of a running Blender cannot be removed there
+    if WINDOWS:  # where os.kill ends whatever it is asked about
+        import _winapi
+
+        try:
+            handle = _winapi.OpenProcess(_winapi.SYNCHRONIZE, False, pid)
+        except PermissionError:
+            return True
+        except OSError:
+            return False
+        try:
+            return _winapi.WaitForSingleObject(handle, 0) == _winapi.WAIT_TIMEOUT
+        finally:
+            _winapi.CloseHandle(handle)
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

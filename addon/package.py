@@ -8,14 +8,13 @@ bpy wheel. What goes into the .zip is decided by blender_manifest.toml.
 from __future__ import annotations
 
 import importlib.util
-import os
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from ..datagen.sequence import InputError
+from ..datagen.sequence import InputError, move
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILDER = "scripts/addons_core/bl_pkg/cli/blender_ext.py"
@@ -25,21 +24,21 @@ def build(folder: str | Path) -> Path:
     """Writes <folder>/timesplat-<version>.zip, whole or not at all; returns its path. Raises InputError where
     there is no Blender, the builder refuses, or the folder cannot be written."""
     folder = Path(folder)
-    tool = [sys.executable, str(_builder())]
+    tool = [sys.executable, "-X", "utf8", str(_builder())]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as tmp:
             _run([*tool, "build", "--source-dir", str(ROOT), "--output-dir", tmp])
             made = next(Path(tmp).glob("*.zip"))
             _run([*tool, "validate", str(made)])
-            os.replace(made, folder / made.name)
+            move(made, folder / made.name)
     except OSError as e:
         raise InputError(f"{folder}: it cannot be written ({e.strerror or e}); choose another folder.") from None
     return folder / made.name
 
 
 def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
     if done.returncode:
         said = (done.stderr.strip() or done.stdout.strip()).splitlines()
         raise InputError(f"{ROOT}: Blender's builder refused: {said[-1] if said else 'it said nothing'}")
@@ -51,7 +50,8 @@ def _builder() -> Path:
     if spec := importlib.util.find_spec("bpy"):
         places.append(Path(spec.origin).resolve().parent)
     if program := shutil.which("blender"):
-        places.append(Path(program).resolve().parent)
+        home = Path(program).resolve().parent
+        places += [home, home.parent / "Resources"]  # the latter on macOS
     for place in places:
         if found := sorted(place.glob(f"[0-9]*.[0-9]*/{BUILDER}")):
             return found[-1]

@@ -15,7 +15,7 @@ from pathlib import Path
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
-from ..datagen.sequence import InputError
+from ..datagen.sequence import WINDOWS, InputError
 
 ROOT = __package__.rpartition(".")[0]  # what Blender knows the add-on by
 DEVICES = [
@@ -60,7 +60,13 @@ def get(context=None):
 
 
 def user_folder(name: str, create: bool = True) -> Path:
-    """A folder for files of the add-on's own, kept between sessions."""
+    """A folder for files of the add-on's own, kept between sessions. On Windows it is not one of Blender's: below
+    those torch's files exceed the 260 characters that a path may have, and they follow users to other computers."""
+    if WINDOWS and (local := os.environ.get("LOCALAPPDATA")):
+        folder = Path(local, "Timesplat", ".".join(map(str, bpy.app.version[:2])), name)
+        if create:
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
     if ROOT.startswith("bl_ext."):
         return Path(bpy.utils.extension_path_user(ROOT, path=name, create=create))
     folder = bpy.utils.user_resource("DATAFILES", path=f"{ROOT}/{name}", create=create)

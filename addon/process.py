@@ -24,7 +24,7 @@ import threading
 import time
 from pathlib import Path
 
-from ..datagen.sequence import InputError
+from ..datagen.sequence import WINDOWS, InputError
 
 PACKAGE = Path(__file__).resolve().parent.parent
 # Imports this folder as the package `timesplat`, whatever the folder is called, and runs one module of it. (Its
@@ -41,6 +41,8 @@ MOST_LOG = 1 << 20  # bytes of log that are kept in the file; beyond that only t
 PIECE = 1 << 16  # longest line that is looked at
 FLOOD = 1 << 20  # bytes between two naps of the reader, so that a child that floods waits, and not Blender
 NAP = 0.02
+# Of Windows: a process in a group of its own, and no console window for it or for what it starts.
+NEW_GROUP, NO_WINDOW = 0x00000200, 0x08000000
 _running: set[Child] = set()
 
 
@@ -51,13 +53,13 @@ def launch(module: str) -> str:
 
 def worker(python: str, request: dict, folder: Path) -> Child:
     """`model.worker` under the interpreter `python`, started at once (the request: see there)."""
-    return Child([python, "-c", launch("model.worker")], request, folder)
+    return Child([python, "-X", "utf8", "-c", launch("model.worker")], request, folder)
 
 
 def ask(python: str, request: dict) -> dict:
     """Runs a request to the worker to its end; for tasks of a few seconds. Returns the "done" event; raises
     InputError with what the worker said."""
-    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         child = worker(python, request, Path(folder))
         try:
             while True:
@@ -84,7 +86,7 @@ class Child:
         self._tail = b""
         env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
         env |= {"PYTHONUNBUFFERED": "1", **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))}
-        group = {"start_new_session": True} if os.name == "posix" else {"creationflags": 0x00000200 | 0x08000000}
+        group = {"creationflags": NEW_GROUP | NO_WINDOW} if WINDOWS else {"start_new_session": True}
         pipe = subprocess.PIPE
         try:
             self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=folder, env=env, **group)
@@ -158,7 +160,8 @@ class Child:
     def _last_words(self) -> str:
         code = self.process.returncode
         said = [x.strip() for x in self._tail.decode("utf-8", "replace").splitlines() if x.strip()]
-        how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        name = hex(code) if code >= 0xC0000000 else code  # as Windows' own are known
+        how = f"was ended by signal {-code}" if code < 0 else f"ended with code {name}"
         return f"The process {how}: {said[-1][:300] if said else 'it said nothing'}"
 
     def kill(self) -> None:
@@ -168,13 +171,17 @@ class Child:
         self.process.wait()
         with contextlib.suppress(OSError):
             self.process.stdin.close()
+        self._logger.join(2.0)  # Windows removes no folder while a file in it is open
 
     def _end_group(self) -> None:
-        if os.name == "posix":
+        if not WINDOWS:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.process.pid, signal.SIGKILL)  # what it started goes too, even after its own end
         elif self.process.poll() is None:
-            subprocess.run(["taskkill", "/F", "/T", "/PID", str(self.process.pid)], capture_output=True)
+            command = ["taskkill", "/F", "/T", "/PID", str(self.process.pid)]
+            with contextlib.suppress(OSError):  # not to be found, say
+                subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, creationflags=NO_WINDOW)
+            self.process.kill()
 
 
 def _pieces(pipe):

@@ -10,7 +10,8 @@ alone, which Blender's own Python runs as a child process; the protocol is that 
     {"task": "uninstall", "folder": F, "work": W}   done {"bytes": freed}
 
 pip's configuration counts (a mirror, a proxy, certificates, constraints). Where it names no index of its own, torch
-comes from PyTorch's index for the build (https://pytorch.org/get-started), the rest from pip's default.
+comes from PyTorch's index for the build (https://pytorch.org/get-started) if pip's default has another build for this
+system; all else comes from pip's default.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import subprocess
 import sys
 import sysconfig
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,14 +45,19 @@ NEEDS = (
     ("OpenEXR", "3.3", "OpenEXR"),
     ("usd-core", "26.3", "pxr"),
 )
-BUILDS = {"cpu": "https://download.pytorch.org/whl/cpu", "cuda": "https://download.pytorch.org/whl/cu128"}
+ALONE = ("-I", "-X", "utf8")  # Python without what the user has set, that speaks UTF-8 on Windows too
+INDEX = {"cpu": "https://download.pytorch.org/whl/cpu", "cuda": "https://download.pytorch.org/whl/cu128"}
 DOWNLOAD = {"cpu": 300e6, "cuda": 4e9}  # bytes, roughly, so that the bar moves evenly
 ELSEWHERE = "or name a Python that has timesplat[torch] in Timesplat's preferences"
+REDISTRIBUTABLE = "install Microsoft's Visual C++ Redistributable, and then the runtime again"
 NETWORK = (
     r"NewConnectionError|ConnectTimeout|ReadTimeout|NameResolutionError|getaddrinfo|ProxyError|SSLError|Max retries|"
     r"Network is unreachable|Connection (refused|reset|aborted)|Temporary failure in name resolution"
 )
+TOO_LONG = r"Windows Long Path support"
 NO_ROOM = r"No space left on device|Disk quota exceeded|not enough space on the disk|WinError 112"
+WINDOWS = os.name == "nt"
+PAUSES = (0.5, 1, 2, 4)  # seconds: on Windows a virus scanner holds for a moment what is new
 PROOF = """
 import importlib, importlib.metadata, json, sys
 versions = {}
@@ -100,10 +107,10 @@ def install(folder: Path, work: Path, build: str, progress) -> dict:
     pip = _make_venv(new)
     python = _python_in(new)
     wanted = [f"{name}>={version}" for name, version, _ in NEEDS]
-    if _has_index(pip):
+    if _has_index(pip) or (build == "cpu" and sys.platform != "linux"):  # elsewhere pip's default is for the CPU
         steps = [(wanted, [], 0.05, 0.92)]
     else:
-        steps = [(wanted[:1], ["--index-url", BUILDS[build]], 0.05, 0.7), (wanted[1:], [], 0.7, 0.92)]
+        steps = [(wanted[:1], ["--index-url", INDEX[build]], 0.05, 0.7), (wanted[1:], [], 0.7, 0.92)]
     for packages, options, first, last in steps:
         command = [*pip, "install", "--no-cache-dir", "--no-compile", "--only-binary", ":all:", "--no-input"]
         command += ["--disable-pip-version-check", "--progress-bar", "off", *options, *packages]
@@ -152,12 +159,12 @@ def _make_venv(folder: Path) -> list[str]:
             f"python3-venv); install them, {ELSEWHERE}."
         )
     python = _python_in(folder)
-    commands = [[sys.executable, "-I", "-m", "venv", "--without-pip", str(folder)]]
+    commands = [[sys.executable, *ALONE, "-m", "venv", "--without-pip", str(folder)]]
     if "ensurepip" in has:
-        commands.append([str(python), "-I", "-m", "ensurepip", "--default-pip"])
+        commands.append([str(python), *ALONE, "-m", "ensurepip", "--default-pip"])
     for command in commands:
         try:
-            done = subprocess.run(command, env=_env(), capture_output=True, text=True)
+            done = _said(command)
         except OSError as e:
             done = subprocess.CompletedProcess(command, 1, "", str(e))
         said = done.stdout + done.stderr
@@ -170,13 +177,13 @@ def _make_venv(folder: Path) -> list[str]:
                 f"{sys.executable}: no virtual environment can be made with this Python ({last}); reinstall Blender, "
                 f"{ELSEWHERE}."
             )
-    outside = [sys.executable, "-I", "-m", "pip", "--python", str(python)]
-    return [str(python), "-I", "-m", "pip"] if "ensurepip" in has else outside
+    outside = [sys.executable, *ALONE, "-m", "pip", "--python", str(python)]
+    return [str(python), *ALONE, "-m", "pip"] if "ensurepip" in has else outside
 
 
 def _has_index(pip: list[str]) -> bool:
     """Whether pip is configured for an index of the user's own, or for none."""
-    done = subprocess.run([*pip, "config", "list"], env=_env(), capture_output=True, text=True)
+    done = _said([*pip, "config", "list"])
     _log(done.stdout + done.stderr)
     return bool(re.search(r"^[\w:]+\.(index-url|no-index)=", done.stdout.replace("_", "-"), re.MULTILINE))
 
@@ -219,6 +226,14 @@ def _fetched(work: Path) -> int:
     return total
 
 
+def _said(command: list[str]) -> subprocess.CompletedProcess:
+    """Runs a program to its end, and what it printed. It must not inherit standard input, which a thread of ours reads:
+    on Windows it would hang at its start (cpython #78961)."""
+    return subprocess.run(
+        command, env=_env(), stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", errors="replace"
+    )
+
+
 _child: subprocess.Popen | None = None
 
 
@@ -259,6 +274,11 @@ def _why(lines: list[str], work: Path) -> str:
     text = "\n".join(lines)
     if re.search(NO_ROOM, text):
         return _no_room(work)
+    if re.search(TOO_LONG, text):
+        return (
+            f"{work}: the names of torch's files are longer than Windows allows below this folder; switch on its long "
+            "paths (LongPathsEnabled), and install again."
+        )
     if found := re.search(NETWORK, text):
         return (
             f"The package index cannot be reached ({found[0]}); check the network, or pip's configuration if there is "
@@ -280,18 +300,22 @@ def _no_room(folder: Path) -> str:
 
 def _prove(python: Path) -> dict[str, str]:
     """Imports everything in the new environment; returns the versions."""
-    command = [str(python), "-I", "-c", PROOF, json.dumps(NEEDS)]
-    done = subprocess.run(command, env=_env(), capture_output=True, text=True)
+    done = _said([str(python), *ALONE, "-c", PROOF, json.dumps(NEEDS)])
     _log(done.stderr)
     if done.returncode:
         last = re.findall(r"^importing (\S+)", done.stderr, re.MULTILINE)
         said = done.stderr.strip().splitlines()[-1][:300] if done.stderr.strip() else f"code {done.returncode}"
-        raise Stop(f"{last[-1] if last else 'Python'} was installed but does not start here ({said}); {ELSEWHERE[3:]}.")
+        todo = REDISTRIBUTABLE if re.search(r"WinError (126|1114)\b", said) else ELSEWHERE[3:]
+        raise Stop(f"{last[-1] if last else 'Python'} was installed but does not start here ({said}); {todo}.")
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def _move(source: Path, target: Path) -> None:
     try:
+        for pause in PAUSES if WINDOWS else ():
+            with contextlib.suppress(PermissionError):
+                return os.rename(source, target)
+            time.sleep(pause)
         os.rename(source, target)
     except OSError as e:
         raise Stop(
@@ -300,7 +324,7 @@ def _move(source: Path, target: Path) -> None:
 
 
 def _python_in(venv: Path) -> Path:
-    return venv / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    return venv / ("Scripts/python.exe" if WINDOWS else "bin/python")
 
 
 def _env() -> dict[str, str]:
@@ -315,10 +339,9 @@ def _log(text: str) -> None:
 
 
 def _leave_when_stdin_closes() -> None:
-    with contextlib.suppress(ValueError):
-        while sys.stdin.readline():
-            pass
-    if os.name == "posix" and os.getpgrp() == os.getpid():
+    while os.read(0, 1 << 16):
+        pass
+    if not WINDOWS and os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGKILL)  # pip and all that it has started, and this process
     if _child and _child.poll() is None:
         _child.kill()

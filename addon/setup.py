@@ -106,7 +106,7 @@ class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
 def _stage(request: dict):
     """A stage of a Job that runs `runtime` under Blender's own Python."""
     request = {**request, "folder": str(preferences.runtime_folder())}
-    command = [sys.executable, "-I", str(Path(runtime.__file__))]
+    command = [sys.executable, "-I", "-X", "utf8", str(Path(runtime.__file__))]
     return lambda folder: process.Child(command, {**request, "work": str(folder)}, folder)
 
 

@@ -122,13 +122,14 @@ def choose(opened, settings: Settings) -> list:
 
 
 def _slugs(clips: list) -> dict:
-    """Clip -> a file name of its own for each."""
-    named = {}
+    """Clip -> a file name of its own for each, also where capitals count for nothing."""
+    named, taken = {}, set()
     for clip in clips:
         slug = base = re.sub(r"[^A-Za-z0-9]+", "-", clip.name).strip("-") or "clip"
         n = 2
-        while slug in named:
+        while slug.lower() in taken:
             slug, n = f"{base}-{n}", n + 1
+        taken.add(slug.lower())
         named[slug] = clip
     return named
 

@@ -73,7 +73,7 @@ def render_assets(
     names = expand(assets)
     todo, seen = [], {}
     for asset in names:
-        other = seen.setdefault(stem(asset), asset)
+        other = seen.setdefault(stem(asset).lower(), asset)  # one folder for both on Windows and macOS
         if other != asset:
             failures.append(f"{asset}: it would be written over that of {other}; rename one of the two.")
         elif finished := _finished(asset, out / stem(asset), settings):
@@ -227,7 +227,7 @@ def _sweep(job: dict) -> None:
 
 def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
     """Runs one job in a child process and passes on its messages; its death is a message too."""
-    with tempfile.TemporaryDirectory(prefix="timesplat-") as tmp:
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as tmp:
         file, log = Path(tmp) / "job.json", Path(tmp) / "log"
         file.write_text(json.dumps(job))
         command = [sys.executable, "-m", "timesplat.datagen.child", str(file), str(log)]
@@ -247,7 +247,7 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
             _sweep(job)
         if code and not said_error:
             reason = f"signal {-code}" if code < 0 else f"exit code {code}"
-            lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+            lines = log.read_text("utf-8", errors="replace").strip().splitlines() if log.exists() else []
             last = f", last line: {lines[-1][:200]}" if lines else ""
             on({"error": f"{job['asset']}: Blender died on it ({reason}{last}); repair or leave out the file."})
 

@@ -14,11 +14,13 @@ Conventions
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -214,6 +216,19 @@ def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None)
 
 # ---------------------------------------------------------------- the folder
 
+WINDOWS = os.name == "nt"
+PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds
+
+
+def move(source: str | Path, target: str | Path) -> None:
+    """os.replace, within a disk. On Windows nothing can be moved while a program has it open, and a virus scanner opens
+    what is new for a moment: there it is tried again for some seconds. Raises OSError."""
+    for pause in PAUSES if WINDOWS else ():
+        with contextlib.suppress(PermissionError):
+            return os.replace(source, target)
+        time.sleep(pause)
+    os.replace(source, target)
+
 
 def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) -> Sequence:
     """Writes a Sequence so that it appears whole or not at all.
@@ -232,16 +247,23 @@ def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) ->
         raise InputError(f"{folder}: it exists and is not a Sequence; it is not overwritten, give another name.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    old = tmp.with_name(f"{tmp.name}.old")
     try:
         fill(tmp)
         (tmp / "transforms.json").write_text(json.dumps(_to_json(seq), indent=1))
         os.chmod(tmp, 0o755)
         if folder.exists():
-            shutil.rmtree(folder)
-        tmp.rename(folder)
+            move(folder, old)
+        try:
+            move(tmp, folder)
+        except BaseException:
+            if old.exists():
+                move(old, folder)
+            raise
     except BaseException:
         shutil.rmtree(tmp, ignore_errors=True)
         raise
+    shutil.rmtree(old, ignore_errors=True)
     return read_sequence(folder)
 
 
@@ -301,7 +323,7 @@ def read_sequence(folder: Path) -> Sequence:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a folder that `timesplat render` wrote.")
     try:
-        d = json.loads(path.read_text())
+        d = json.loads(path.read_text(encoding="utf-8"))
         norm = d.get("normalisation", {})
         seq = Sequence(
             width=int(d["w"]),

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datagen.sequence import InputError, Sequence
+from ..datagen.sequence import WINDOWS, InputError, Sequence, move
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C0 * f_dc
 VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment (the paper's filter)
@@ -169,10 +169,12 @@ def atomic(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield tmp
-        os.replace(tmp, path)
+        move(tmp, path)
     except OSError as e:
-        why = e.strerror or e
-        raise InputError(f"{path}: it cannot be written ({why}); choose another place.") from None
+        todo = "choose another place"
+        if WINDOWS and isinstance(e, PermissionError) and path.is_file():
+            todo = f"close the program that has it open, or {todo}"
+        raise InputError(f"{path}: it cannot be written ({e.strerror or e}); {todo}.") from None
     finally:
         with suppress(OSError):  # where the folder is a file, say
             tmp.unlink(missing_ok=True)

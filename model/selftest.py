@@ -48,7 +48,7 @@ def selftest(device: str = "cpu", checkpoint: Path | None = None, progress=None)
     one that is used, None for those that come with Timesplat. `progress(fraction, text)` is called between checks.
     Raises nothing but what the interpreter itself does."""
     report, failed = [], set()
-    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         s = SimpleNamespace(device=device, checkpoint=checkpoint, folder=Path(folder))
         for i, (check, needs, remedy) in enumerate(CHECKS):
             name = check.__name__.strip("_").replace("_", " ")
