@@ -309,6 +309,8 @@ def measured(frames: list[int], objects: list | None = None, *, rendered: bool =
         else:
             for ob in layer.objects:
                 ob.hide_set(False, view_layer=layer)
+                stack.callback(setattr, ob, "hide_viewport", ob.hide_viewport)
+                ob.hide_viewport = False
         for frame in dict.fromkeys(frames):
             stage.frame_set(frame)
             if not rendered:
