@@ -212,3 +212,93 @@ def test_what_the_settings_select(blender):
     assert counts["learnt"] == round(0.9 * 5 * 128**2)
     assert counts["ALL 9 256"][0] == 2 * NEAR_FEW
     assert counts["SHARE 0 128"][1] - counts["ALL 0 128"][1] == pytest.approx(5)
+
+
+MEANWHILE = """
+part("addon").register()
+reconstruct, model, jobs = part("addon.reconstruct"), part("model.asset"), part("addon.jobs")
+Vector = part("addon.reconstruct").Matrix.Translation
+begun, results = [], {}
+jobs.start = lambda label, stages, finish, *rest, **named: begun.append(finish)
+folder = reconstruct.Path(sys.argv[1])
+clip = model.Clip(24, 1, 2, 1.0, (1.0, 2.0, 3.0))
+rows = {"xyz": 3, "t": 0, "velocity": 3, "sigma_t": 0, "scale": 3, "rotation": 4, "rgb": 3, "opacity": 0}
+parts = {k: np.full((2, n) if n else 2, 0.5, np.float32) for k, n in rows.items()}
+model.write_ply(folder / "asset.ply", model.Asset(**parts, clip=clip))
+
+def when(name, before, meanwhile, after=lambda *_: None, **options):
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    scene, box = bpy.context.scene, bpy.data.objects["Cube"]
+    box.location = (1, 2, 3)
+    before(box)
+    for k, v in options.items():
+        setattr(scene.timesplat, k, v)
+    scene.timesplat.method = "lift"
+    bpy.context.view_layer.update()
+    reconstruct.start(scene.timesplat, bpy.context)
+    meanwhile(box)
+    begun.pop()({}, folder)
+    ob = bpy.context.object
+    after(ob)
+    bpy.context.view_layer.update()
+    results[name] = [ob.parent.name if ob.parent else None, list(ob.matrix_world.translation),
+                     sorted(ob["timesplat_source"])]
+
+def other(box):
+    ob = box.copy()
+    ob.name = "Other"
+    bpy.context.scene.collection.objects.link(ob)
+    return ob
+
+def rename(box):
+    box.name = "New"
+    other(box).name = "Cube"
+
+def child(box):
+    box.parent = bpy.data.objects.new("Root", None)
+    bpy.context.scene.collection.objects.link(box.parent)
+    bpy.ops.object.select_all(action="DESELECT")
+    box.select_set(True)
+
+def shift(*path):
+    def do(ob):
+        for p in path:
+            ob = getattr(ob, p)
+        ob.location.x += 5
+    return do
+
+nothing = lambda box: None
+when("nothing", nothing, nothing)
+when("moved after", nothing, nothing, shift("parent"))
+when("moved meanwhile", nothing, shift())
+when("renamed", nothing, rename)
+when("deleted", other, lambda box: bpy.data.objects.remove(box))
+when("the only one deleted", nothing, lambda box: bpy.data.objects.remove(box))
+when("flat", lambda box: setattr(box, "scale", (1, 1, 0)), nothing)
+when("hidden", lambda box: box.hide_set(True), nothing)
+when("hidden and disabled", lambda box: setattr(box, "hide_viewport", True), nothing)
+when("a selected child", child, nothing, shift("parent", "parent"), source="SELECTED")
+when("keyed", lambda box: box.keyframe_insert("location", frame=1), nothing)
+tell(results=results)
+"""
+
+
+def test_what_becomes_of_the_original_meanwhile(blender, tmp_path):
+    here, beside = [1, 2, 3], [6, 2, 3]
+    results = blender(MEANWHILE, tmp_path)["results"]
+    for name, parent, place, source in (
+        ("nothing", "Cube", here, ["Cube"]),
+        ("moved after", "Cube", beside, ["Cube"]),
+        ("moved meanwhile", "Cube", beside, ["Cube"]),
+        ("renamed", "New", here, ["New"]),
+        ("deleted", None, here, ["Other"]),
+        ("the only one deleted", None, here, []),
+        ("flat", None, here, ["Cube"]),
+        ("hidden", "Cube", here, ["Cube"]),
+        ("hidden and disabled", "Cube", here, ["Cube"]),
+        ("a selected child", "Cube", beside, ["Cube"]),
+        ("keyed", None, here, ["Cube"]),
+    ):
+        got = results[name]
+        assert [got[0], got[2]] == [parent, source], (name, got)
+        np.testing.assert_allclose(got[1], place, atol=1e-5, err_msg=name)
