@@ -102,13 +102,14 @@ def reconstruct_views(
         from .refine import refine as fit
 
         check_seconds(refine)
-        near = method in NEEDS_PASSES
+        near, drawing = method in NEEDS_PASSES, _draws(device)
         # What is fused into a few thousand Gaussians may start from small pictures, in a quarter of the time.
         seen = views if near or method in FITTED or "%" in (budget or "") else start_size(views)
         start = reconstruct_views(seen, method, device, checkpoint, seconds, dense=dense)
         if budget:
-            return reduced(start, views, budget, refine, near=near, max_loss=max_loss, device=device, progress=progress)
-        return fit(start, views, refine, device, near=near, progress=progress)
+            told = {"near": near, "max_loss": max_loss, "device": drawing, "progress": progress}
+            return reduced(start, views, budget, refine, **told)
+        return fit(start, views, refine, drawing, near=near, progress=progress)
     if method in ("white", "hull"):
         from .baselines import hull
 
@@ -121,8 +122,7 @@ def reconstruct_views(
         from .baselines.four_dgs import four_dgs
         from .baselines.som import som
 
-        check_device(device)
-        return {"4dgs": four_dgs, "som": som}[method](views, device, seconds, progress=progress)
+        return {"4dgs": four_dgs, "som": som}[method](views, _draws(device), seconds, progress=progress)
     network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
 
     def run(views: Views) -> Gaussians4D:
@@ -173,6 +173,13 @@ def check_device(device: str) -> None:
     except (RuntimeError, AssertionError) as e:
         reason = str(e).splitlines()[0]
         raise InputError(f"{device}: torch cannot use this device here ({reason}); choose cpu.") from None
+
+
+def _draws(device: str) -> str:
+    """The device that scenes are fitted on: this one if it is CUDA's, else the processor; there is no rasteriser for
+    others, such as Apple's."""
+    check_device(device)
+    return device if torch.device(device).type == "cuda" else "cpu"
 
 
 def load_network(path: Path, device: str = "cpu"):

@@ -135,3 +135,11 @@ def test_methods_that_fit_take_their_seconds_and_tell(sphere_folder):
     told = []
     g = reconstruct(read_sequence(sphere_folder), "4dgs", seconds=0.2, progress=lambda f, text: told.append((f, text)))
     assert g.alive().all() and told[-1][0] == pytest.approx(1) and told[-1][1].startswith("4dgs, step ")
+
+
+@pytest.mark.parametrize("options", [{"method": "lift", "refine": 0.1}, {"method": "4dgs", "seconds": 0.1}])
+def test_scenes_are_fitted_on_the_processor_where_the_device_has_no_rasteriser(sphere_folder, options):
+    """As Apple's has none; torch's "meta" stands for it here."""
+    seq = read_sequence(sphere_folder)
+    scene = reconstruct(seq, indices=seq.select(rig="input"), device="meta", **options)
+    assert len(scene) > 50 and scene.xyz.device.type == "cpu"
