@@ -299,5 +299,5 @@ def write_metrics(folder: Path, metrics: dict) -> None:
         texts |= {"tables.md": tables_md(metrics), "tables.csv": tables_csv(metrics)}
     for name, text in texts.items():
         tmp = folder / f".{name}.tmp"
-        tmp.write_text(text)
+        tmp.write_text(text, encoding="utf-8")
         tmp.replace(folder / name)

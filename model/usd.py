@@ -100,7 +100,7 @@ def write_usd(
         raise InputError(f"{path}: its motion is not a finite matrix for each frame of the clip; export it again.")
     _, Sdf, _, _, UsdUtils, _ = pxr()
     stage = _stage(asset, mode, half, path, motion, variants=original is not None)
-    with atomic(path) as tmp, tempfile.TemporaryDirectory() as folder, quiet():
+    with atomic(path) as tmp, tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, quiet():
         package = Path(folder) / "package.usdz" if path.suffix.lower() == ".usdz" else None
         inner = Path(folder) / "splats.usdc" if package else tmp
         if original is not None:
@@ -145,7 +145,7 @@ def _add_original(layer, original: Path, shift: float, path: Path, folder: Path)
                 raise InputError(f"{original}: it refers to {name}, outside of its own folder; copy that beside it.")
             if not name.lower().endswith(PACKAGED):
                 raise InputError(f"{original}: it refers to {name}, which has no place in a .usdz; write a .usdc.")
-        where = str(original.resolve())
+        where = original.resolve().as_posix()
     else:
         where = _relative(original, path)
 
