@@ -16,6 +16,7 @@ from pathlib import Path
 import bpy
 
 from ..datagen import rigs
+from ..datagen.scene import object_mode
 from ..datagen.sequence import InputError
 from . import jobs, reconstruct, settings
 from .capture import shoot
@@ -57,6 +58,7 @@ def main(argv: list[str]) -> int:
     for key in settings.KEYS:
         if getattr(args, key, None) is not None:
             setattr(chosen, key, getattr(args, key))
+    object_mode()
     try:
         _render(chosen, args) if args.command == "render" else _reconstruct(chosen, args)
     except InputError as e:

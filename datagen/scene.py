@@ -73,6 +73,7 @@ def open_asset(path: Path) -> Asset:
     except RuntimeError as e:
         reason = str(e).strip().splitlines()[-1].removeprefix("Error: ").rstrip(".") if str(e) else "damaged"
         raise InputError(f"{path}: Blender cannot read it ({reason}); export it again.") from None
+    object_mode()
     for ob in list(bpy.data.objects):
         if ob.type in ("LIGHT", "CAMERA", "LIGHT_PROBE", "SPEAKER"):
             bpy.data.objects.remove(ob)
@@ -82,6 +83,12 @@ def open_asset(path: Path) -> Asset:
     rest = rest_pose()  # before anything is evaluated: the first frame_set would overwrite it
     imported = suffix in (".glb", ".gltf", ".fbx", ".obj")
     return Asset(path, digest, find_clips(imported), warnings, rest)
+
+
+def object_mode() -> None:
+    """Leaves the mode that the file was saved in: a mesh in Edit Mode is neither measured nor rendered."""
+    if bpy.context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
 
 
 class _KeepRestPose:

@@ -161,6 +161,8 @@ def test_blend_shows_its_scene_then_its_other_actions_and_never_runs_scripts(tmp
     text = bpy.data.texts.new("startup.py")
     text.write(f"open({str(tmp_path / 'ran')!r}, 'w')")
     text.use_module = True
+    bpy.context.view_layer.objects.active = ob
+    bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     asset = scene.open_asset(tmp_path / "a.blend")
     assert not (tmp_path / "ran").exists()

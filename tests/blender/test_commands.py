@@ -17,6 +17,7 @@ for o in list(bpy.data.objects):
     bpy.data.objects.remove(o)
 bpy.ops.mesh.primitive_uv_sphere_add(location=(3, 0, 0))
 bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 4
+bpy.ops.object.mode_set(mode="EDIT")  # as many a file is saved
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
 tell()
 """
