@@ -226,7 +226,7 @@ def export(args: argparse.Namespace) -> int:
     elif args.out.suffix.lower() == ".ply":
         write_ply(args.out, asset)
     elif args.out.suffix.lower() == ".blend":
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             ply = Path(folder) / f"{args.asset.stem}.ply"
             write_ply(ply, asset)
             save_blend(ply, args.out)

@@ -75,7 +75,7 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
     if not python:
         usd.write_usd(path, asset, mode=mode, half=half, original=original, motion=motion)
         return usd.check_usd(path)
-    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "asset.ply"
         write_ply(copy, asset)
         request = {"task": "export", "asset": str(copy), "out": str(path.resolve()), "mode": mode, "half": half}
@@ -91,7 +91,7 @@ def original_usd(ob, path: Path, frames: range, context):
     """Yields a .usdc of the objects that the asset was made from, over these frames: a temporary one for a .usdz, which
     takes it in, else <name>_original.usdc beside `path`, which refers to it. Raises InputError."""
     if path.suffix.lower() == ".usdz":
-        with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+        with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
             _export_original(ob, Path(folder) / "original.usdc", frames, context)
             yield Path(folder) / "original.usdc"
         return

@@ -54,7 +54,7 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
     if not python:
         asset, motion = usd.read_moving(path)
         return formats.Loaded(asset, "Z"), motion
-    with tempfile.TemporaryDirectory(prefix="timesplat-") as folder:
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
         process.ask(python, request)

@@ -158,6 +158,11 @@ def _make_venv(folder: Path) -> list[str]:
             f"{sys.executable}: this Python comes without venv and ensurepip (Debian and Ubuntu keep them in "
             f"python3-venv); install them, {ELSEWHERE}."
         )
+    if "/AppTranslocation/" in sys.executable:
+        raise Stop(
+            f"{sys.executable}: macOS runs this Blender from a place that is gone tomorrow; move it into the folder "
+            "Applications, start it there, and install again."
+        )
     python = _python_in(folder)
     commands = [[sys.executable, *ALONE, "-m", "venv", "--without-pip", str(folder)]]
     if "ensurepip" in has:

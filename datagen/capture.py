@@ -106,7 +106,7 @@ def capture(
         (folder / "images").mkdir()
         (folder / "passes").mkdir() if passes else None
         with contextlib.ExitStack() as stack:
-            tmp = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            tmp = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
             stage = stack.enter_context(borrowed(objects, lights=not lighting))
             made = stack.enter_context(temporary())
             render_settings(stage, width, height, samples, passes, engine, device, threads)

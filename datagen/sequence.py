@@ -18,8 +18,8 @@ import contextlib
 import json
 import math
 import os
+import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -246,12 +246,13 @@ def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) ->
     ):
         raise InputError(f"{folder}: it exists and is not a Sequence; it is not overwritten, give another name.")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    # Not by `tempfile`, whose folders belong to this user alone, on Windows for good.
+    tmp = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
+    tmp.mkdir()
     old = tmp.with_name(f"{tmp.name}.old")
     try:
         fill(tmp)
         (tmp / "transforms.json").write_text(json.dumps(_to_json(seq), indent=1))
-        os.chmod(tmp, 0o755)
         if folder.exists():
             move(folder, old)
         try:

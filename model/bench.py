@@ -204,7 +204,7 @@ def measure(name: str, seq: Sequence, point: Point) -> dict:
 
 def megabytes(scene, seq: Sequence) -> tuple[float | None, float | None]:
     """Of the scene as .ply and, where pxr is installed, as .usdc."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         ply, usd = Path(folder) / "a.ply", Path(folder) / "a.usdc"
         try:
             asset = scene.to_asset(clip_of(seq))

@@ -2,11 +2,13 @@
 """What Windows and macOS do otherwise than Linux, as far as it can be played here: files that are open cannot be moved,
 programs speak the code page of the country, capitals count for nothing, functions of POSIX are not there."""
 
+import ast
 import json
 import os
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import pytest
 
@@ -94,6 +96,25 @@ def test_a_sequence_that_cannot_be_put_in_place_leaves_the_old(tmp_path, monkeyp
     with pytest.raises(PermissionError):
         make_sequence(folder, frames=2)
     assert len(read_sequence(folder).views) == 3 and os.listdir(tmp_path) == ["a"]
+
+
+def test_a_sequence_is_open_to_those_to_whom_new_folders_are(tmp_path):
+    before = os.umask(0o027)
+    try:
+        make_sequence(tmp_path / "a")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o750
+
+
+def test_no_temporary_folder_fails_because_a_scanner_holds_a_file_in_it():
+    calls, root = [], Path(sequence.__file__).parent.parent
+    for file in [root / "cli.py", *(f for d in ("addon", "datagen", "model") for f in (root / d).glob("*.py"))]:
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "tempfile.TemporaryDirectory":
+                calls.append((file.name, {k.arg for k in node.keywords}))
+    assert len(calls) > 5
+    assert [c for c in calls if "ignore_cleanup_errors" not in c[1] and "dir" not in c[1]] == []
 
 
 # ---------------------------------------------------------------- letters
@@ -294,6 +315,14 @@ def test_torch_lacks_a_library_of_microsofts(monkeypatch, tmp_path):
     monkeypatch.setattr(runtime, "_said", lambda command: subprocess.CompletedProcess(command, 1, "", said))
     with pytest.raises(runtime.Stop, match=r"^torch was installed but does not start.*Visual C\+\+ Redistributable"):
         runtime._prove(tmp_path / "python")
+
+
+def test_a_blender_that_macos_runs_from_elsewhere_gets_no_runtime(monkeypatch, tmp_path):
+    """It would be gone with that place."""
+    place = "/private/var/folders/zz/T/AppTranslocation/0A/d/Blender.app/Contents/Resources/5.2/python/bin/python3.13"
+    monkeypatch.setattr(sys, "executable", place)
+    with pytest.raises(runtime.Stop, match="move it into the folder Applications"):
+        runtime._make_venv(tmp_path / "venv")
 
 
 def test_a_new_runtime_is_moved_although_a_scanner_looks_at_it(tmp_path, monkeypatch):
