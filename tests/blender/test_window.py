@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from timesplat.model import slices
 from timesplat.model.asset import Clip, read_ply, write_ply
-from timesplat.model.usd import check_usd
+from timesplat.model.usd import check_usd, write_usd
 
 from .helpers import REAL, TARGET, make
 from .window import Window, missing
@@ -316,3 +317,45 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
         w.picture("compared")
         assert w.ask("list(bpy.data.images['Timesplat Compare'].size)")[0] == 3 * 384
     assert list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*")) == []
+
+
+def test_files_that_are_dropped_on_the_view(window, tmp_path):
+    """From another program, as XDND: an asset, two files as a sequence, USD, and one that is no PLY."""
+    xdnd = pytest.importorskip("tests.blender.xdnd", reason="python-xlib is not installed", exc_type=ImportError)
+    asset = make(300)
+    write_ply(tmp_path / "our clip ü.ply", asset)
+    for i, frame in enumerate((12, 20)):
+        slices.write_slice(tmp_path / f"slice{i}.ply", asset, frame)
+    (tmp_path / "letter.ply").write_text("Dear Blender, this is no PLY.\n")
+    write_usd(tmp_path / "asset.usdz", asset)
+    with window(tmp_path / "monkey.blend", TIMESPLAT_PYTHON=sys.executable) as w:
+        view = w.area("VIEW_3D")
+        x, y = round(view["x"] + view["w"] / 3), round(view["y"] + view["h"] / 2)
+
+        def dropped(*names: str) -> None:
+            """Drops; chooses Timesplat where Blender asks who shall read the files; presses OK."""
+            w.move(x, y)
+            time.sleep(0.7)
+            xdnd.drop(w.env["DISPLAY"], x, y, [tmp_path / n for n in names])
+            time.sleep(1.5)
+            w.picture(f"dropped {names[0]}")
+            if names[0].endswith(".ply"):  # Blender reads them too
+                w.click(x + 30, w.find("timesplat.import_asset", x + 30, y - 25, y + 60))
+                time.sleep(1)
+                w.picture(f"chosen {names[0]}")
+            w.key("Return")
+
+        dropped("our clip ü.ply")
+        w.wait_for("bpy.context.object.name == 'our clip ü'")
+        assert w.ask(COUNT) == 300 and "300 Gaussians from our clip ü.ply" in w.said()
+        dropped("slice0.ply", "slice1.ply")
+        w.wait_for(f"bpy.context.object.name == {tmp_path.name!r}")
+        assert f"from 2 files in {tmp_path.name}" in w.said()
+        dropped("asset.usdz")
+        w.wait_for("bpy.context.object.name == 'asset'", 120)
+        assert w.ask(COUNT) == 300
+        dropped("letter.ply")
+        time.sleep(1)
+        w.picture("refused")
+        assert f"{tmp_path / 'letter.ply'}: it is not a .ply file" in w.ask("reports()")
+        assert w.ask("sum('timesplat' in o for o in bpy.data.objects)") == 3

@@ -37,6 +37,17 @@ def tab():  # of the 3D viewport's sidebar
 def clipboard():  # and emptied, so that what is copied next is new
     said, bpy.context.window_manager.clipboard = bpy.context.window_manager.clipboard, ""
     return said
+def reports():  # what Blender has said, as its Info editor lists it: one is opened for as long
+    window = bpy.context.window_manager.windows[0]
+    area = next(a for a in window.screen.areas if a.type == "OUTLINER")
+    area.type = "INFO"
+    try:
+        with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
+            bpy.ops.info.select_all(action="SELECT")
+            bpy.ops.info.report_copy()
+    finally:
+        area.type = "OUTLINER"
+    return clipboard()
 def look():
     return [dict(w=w.width, h=w.height, x=w.x, y=w.y, areas=areas(w)) for w in bpy.context.window_manager.windows]
 def answer():
