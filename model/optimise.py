@@ -202,6 +202,8 @@ def optimise(
         rgb, alpha = render(here, seen.c2w, seen.intrinsics, seen.time, width, height, background=behind)
         loss(Step(rgb, alpha, seen, behind, here, fraction)).backward()
         done += 1
+        if done == 1:  # it may have compiled the kernels: its time counts for nothing
+            start, told = clock(), 0.0
         if edit:
             edit(done, fraction)
         parameters.step(fraction)

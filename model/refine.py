@@ -95,7 +95,6 @@ def refine(
         raise InputError("Refinement is of 4D Gaussians, and this method's scene is of another kind; leave it out.")
     if (seconds == 0 and not steps) or not len(start) or (len(views) < FEWEST and not near and count is None):
         return start
-    began = clock()
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g = g[g.alive()]
@@ -115,6 +114,7 @@ def refine(
             if e < least:
                 g = better = moved
         if fusing:
+            began = clock()  # what stands before may have compiled the kernels
             most = count or limit(views, near)
             beside = around(g, views, seed) if near else None
             values, price = few(g, most, near)
@@ -122,7 +122,7 @@ def refine(
                 values,
                 RATES,
                 views,
-                max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
+                max((1 - first) * seconds - (clock() - began), 0.5 * (1 - first) * seconds),
                 beside=beside,
                 most=most,
                 price=price,

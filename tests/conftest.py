@@ -1,5 +1,7 @@
 """Shared by all tests: the --slow switch, and what makes every run the same."""
 
+import itertools
+
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -21,6 +23,14 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+
+
+@pytest.fixture
+def steady_clock(monkeypatch):
+    """A fit of so many seconds takes as many steps on every machine: each look at its clock is 10 ms later."""
+    ticks = itertools.count()
+    for module in ("optimise", "refine"):
+        monkeypatch.setattr(f"timesplat.model.{module}.clock", lambda: 0.01 * next(ticks))
 
 
 @pytest.fixture(scope="session")

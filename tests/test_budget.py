@@ -32,7 +32,7 @@ def test_what_a_budget_says():
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_a_share_is_kept_to(scene, near, monkeypatch):
+def test_a_share_is_kept_to(scene, near, monkeypatch, steady_clock):
     inputs, others = scene
     start = lift(inputs)
     monkeypatch.setattr(budget, "SECONDS", 1.0)
@@ -72,7 +72,7 @@ def test_the_search_ends_where_twice_as_many_are_no_better(scene, monkeypatch):
         fewest(start, inputs, 0.0, near=False)
 
 
-def test_the_search_as_it_is_used(scene, monkeypatch):
+def test_the_search_as_it_is_used(scene, monkeypatch, steady_clock):
     inputs, _ = scene
     monkeypatch.setattr(budget, "TRIAL", 0.2)
     told = []
@@ -80,7 +80,9 @@ def test_the_search_as_it_is_used(scene, monkeypatch):
     assert n in (tried[-2][0], tried[-1][0]) and told == sorted(told) and all(10 < db < 60 for _, db in tried)
 
 
-def test_as_part_of_a_reconstruction_and_from_the_command_line(scene, write_views, tmp_path, capsys, monkeypatch):
+def test_as_part_of_a_reconstruction_and_from_the_command_line(
+    scene, write_views, tmp_path, capsys, monkeypatch, steady_clock
+):
     inputs, others = scene
     monkeypatch.setattr(budget, "SECONDS", 0.3)
     monkeypatch.setattr(budget, "TRIAL", 0.1)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from timesplat.model import optimise as module
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.optimise import BETAS, EPSILON, Parameters, gradients, optimise, own, photographs, shrunk
 
@@ -70,3 +71,24 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
     assert drawn[0] == (2, min(size, 100), min(size, 100), 3) and drawn[-1] == (2, size, size, 3)
     with gradients():
         assert optimise(p, scene, mine, photographs, 1e9, enough=3) == 3
+
+
+def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatch):
+    """Each step takes a second of this clock, the first, which compiles, a minute."""
+    now, told = [0.0], []
+    monkeypatch.setattr(module, "clock", lambda: now[0])
+    one = torch.ones(1)
+    with gradients():
+        views = own(spheres([0, 12], size=16))
+        p = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)})
+
+        def scene():
+            turn = torch.tensor([[1.0, 0, 0, 0]])
+            return Gaussians4D(0 * p["rgb"], 0 * one, 0 * p["rgb"], one, torch.ones(1, 3), turn, p["rgb"], one)
+
+        def loss(step):
+            now[0] += 1 if now[0] else 60
+            return photographs(step)
+
+        assert optimise(p, scene, views, loss, 8, progress=lambda fraction, text: told.append(fraction)) == 9
+    assert told == [i / 8 for i in range(1, 9)]

@@ -111,7 +111,7 @@ def test_refusals(scene):
         refine(object(), inputs, 1.0)
 
 
-def test_from_the_command_line_and_in_the_tables(scene, write_views, tmp_path, capsys):
+def test_from_the_command_line_and_in_the_tables(scene, write_views, tmp_path, capsys, steady_clock):
     inputs, others = scene
     folder = tmp_path / "spheres"
     write_views(inputs, folder, others)
