@@ -28,7 +28,7 @@ def test_two_processes_equal_one_with_twice_the_samples(sphere_folder, tmp_path)
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     for name, start, accumulate in (("one", [sys.executable], "4"), ("two", launch, "2")):
         command = [*start, str(script), *common, "--out", str(tmp_path / name), "--accumulate", accumulate]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, done.stderr
     one, two = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("one", "two"))
     assert one["progress"]["step"] == two["progress"]["step"] == 3

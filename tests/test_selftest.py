@@ -53,7 +53,7 @@ def test_the_worker_hands_the_report_over():
     """Of a device that is not there, which ends soon."""
     request = json.dumps({"task": "selftest", "device": "nonsense", "checkpoint": "nowhere.safetensors"})
     command = [sys.executable, "-m", "timesplat.model.worker"]
-    run = subprocess.run(command, input=request + "\n", capture_output=True, text=True, timeout=120)
+    run = subprocess.run(command, input=request + "\n", capture_output=True, text=True, timeout=600)
     events = [json.loads(line) for line in run.stdout.splitlines()]
     assert run.returncode == 0 and [e["event"] for e in events] == ["progress"] * len(NAMES) + ["done"]
     lines = by_name(events[-1]["report"])

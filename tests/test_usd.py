@@ -539,7 +539,7 @@ print("RESULT" + str(Usd.GetVersion()))
 
 
 def child(code, *args) -> str:
-    run = subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, timeout=120)
+    run = subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, timeout=600)
     line = next((x for x in run.stdout.splitlines() if x.startswith("RESULT")), None)
     assert run.returncode == 0 and line, run.stdout + run.stderr
     return line.removeprefix("RESULT")

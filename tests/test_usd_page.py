@@ -398,7 +398,7 @@ print("RESULT" + json.dumps(out))
 
 def child(code, *args, cwd=None) -> dict:
     command = [sys.executable, "-c", code, *map(str, args)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=cwd)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=cwd)
     line = next((x for x in run.stdout.splitlines() if x.startswith("RESULT")), None)
     assert run.returncode == 0 and line, run.stdout + run.stderr
     return json.loads(line.removeprefix("RESULT"))

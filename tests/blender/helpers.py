@@ -78,7 +78,7 @@ class Runner:
         """The same without waiting: for tests that end Blender themselves."""
         return start(HEAD + self.head + textwrap.dedent(code), args, self.folder, {**self.env, **(env or {})})
 
-    def __call__(self, code: str, *args, env: dict | None = None, timeout: float = 300) -> dict:
+    def __call__(self, code: str, *args, env: dict | None = None, timeout: float = 600) -> dict:
         process = self.start(code, *args, env=env)
         try:
             said, _ = process.communicate(timeout=timeout)

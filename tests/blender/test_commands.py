@@ -41,7 +41,7 @@ def command(installed, tmp_path):
             done = subprocess.run(line, capture_output=True, text=True, env=env | {"TMPDIR": str(installed.tmp)})
             return done.returncode, done.stdout + done.stderr
         process = installed.start(CALL, scene, *args)
-        said, _ = process.communicate(timeout=300)
+        said, _ = process.communicate(timeout=600)
         code = [line for line in said.splitlines() if line.startswith("RESULT")]
         return int(code[0].split(":")[1].strip(" }")) if code else process.returncode, said
 

@@ -333,7 +333,7 @@ tell(**result)
 
 
 def test_installed_from_the_preferences(installed, index):
-    told = installed(ABLE + WHOLE, sys.executable, env=pip(index), timeout=240)
+    told = installed(ABLE + WHOLE, sys.executable, env=pip(index))
     assert "Preferences > System > Network > Allow Online Access" in told["offline"] and told["refused"] == []
     assert told["online"] is True
     if not told["able"]:  # Debian's Blender
