@@ -24,6 +24,7 @@ SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C
 VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment (the paper's filter)
 STATIC_SIGMA_T = 1e4  # lifetime of what does not change: exp(-½(2/1e4)²) is 1 in float32
 BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
+LONGEST, LAST = 50_000, 1 << 20  # frames: more than half an hour; and as far as Blender counts
 OPACITY_EPS = 1e-6  # opacities are kept this far from 0 and 1 in a .ply, where they are logits
 
 VERSION = 1
@@ -131,11 +132,14 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
     if np.abs(np.linalg.norm(asset.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
         raise bad("rotation holds quaternions that are not of unit length")
     c = asset.clip
-    numbers = [c.fps, c.scale, c.pixel, *c.translation]
-    if not (np.isfinite(numbers).all() and c.fps > 0 and c.scale > 0 and c.pixel >= 0):
+    with np.errstate(over="ignore"):  # in single precision, as Blender has them
+        numbers = np.array([c.fps, c.scale, c.pixel, *c.translation], np.float32)
+    if not (np.isfinite(numbers).all() and (numbers[:2] > 0).all() and c.pixel >= 0):
         raise bad("fps and scale must be positive, pixel not negative, and these and translation finite")
     if len(c.translation) != 3 or c.frame_end < c.frame_start:
         raise bad("the clip's frame range is empty or its translation is not three numbers")
+    if c.frame_end - c.frame_start >= LONGEST or max(abs(c.frame_start), abs(c.frame_end)) > LAST:
+        raise bad(f"the clip's frames run from {c.frame_start} to {c.frame_end}, which is too many or too far")
 
 
 def pixel_size(sequence: Sequence) -> float:
@@ -260,7 +264,7 @@ def read_ply(path: str | Path) -> Asset:
             )
         return out
 
-    with np.errstate(over="ignore"):  # what overflows is refused by `check`
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
         quaternion = get("rot_0", "rot_1", "rot_2", "rot_3")
         length = np.linalg.norm(quaternion, axis=1, keepdims=True)
         quaternion = np.where(length > 0, quaternion / np.maximum(length, 1e-300), [1.0, 0, 0, 0])
@@ -301,6 +305,8 @@ def _header(head: bytes, path: Path) -> tuple[list[str], np.dtype, int, dict[str
                 if word[1] == "vertex":
                     count = int(word[2])
             elif word[:1] == ["property"] and elements[-1] == "vertex":
+                if order is None:
+                    raise ValueError("it names no format")
                 props.append((word[2], order + _TYPES[word[1]]))
         if elements[:1] != ["vertex"]:
             first = elements[0] if elements else "nothing"

@@ -35,7 +35,7 @@ from .asset import (
 )
 
 SUFFIXES = (".ply", ".splat", ".spz")
-MOST = 20_000_000  # Gaussians that a compressed file or a sequence may hold; Niantic's reader stops at half
+MOST = 10_000_000  # Gaussians that a compressed file or a sequence may hold, as in Niantic's reader
 SHARE = 1 / 3  # σ_t of a sequence's Gaussians in frames: 1.1 % of their opacity is left a frame away
 _MAX_HEADER = 1 << 16
 _KINDS = {  # how files begin that may turn up under one of our suffixes
@@ -88,6 +88,8 @@ def read(path: str | Path) -> Loaded:
         raise InputError(f"{path}: no such file; check the name.") from None
     except OSError as e:
         raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
+    except MemoryError:
+        raise InputError(f"{path}: it takes more memory than there is; close other programs or reduce it.") from None
 
 
 def read_sequence(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: int = 1) -> Loaded:
@@ -336,10 +338,11 @@ def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> Loade
     if not 0 < n <= MOST or fraction > 30:
         raise InputError(f"{path}: it claims {n:,} Gaussians; 1 to {MOST:,} can be read, and it may be damaged.")
     widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3)
-    parts, packs = [], 40_000 if version == 4 else 1_040  # at most, a byte into so many
-    possible = sum(widths) * n <= packs * path.stat().st_size
+    if n > 100_000 and sum(widths) * n > 100 * path.stat().st_size:  # splats pack to a third; this is a bomb
+        raise EOFError(f"{n} Gaussians were announced, and so few bytes hold no more than repetition")
+    parts = []
     for number, width in enumerate(widths):
-        data = section(width * n, number) if possible else b""
+        data = section(width * n, number)
         if len(data) < width * n:
             raise EOFError(f"{n} Gaussians were announced, and there are fewer")
         parts.append(np.frombuffer(data, np.uint8).reshape(n, width))

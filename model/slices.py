@@ -50,9 +50,10 @@ def apart(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     it starts as good as nothing and grows, as soon as it has half of its size. Raises InputError for a flat one."""
     matrices = np.asarray(matrices, np.float64)
     still = np.allclose(matrices, matrices[0], rtol=1e-9, atol=1e-12)
-    size = np.abs(np.linalg.det(matrices[:, :3, :3])) if np.isfinite(matrices).all() else np.zeros(1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.abs(np.linalg.det(matrices[:, :3, :3]))
     rest = matrices[int((size >= size.max() / 8).argmax())]
-    if size.max() < 1e-27:
+    if not (np.isfinite(matrices).all() and 1e-27 <= size.max() < np.inf):
         raise InputError("The object is scaled to nothing; give it a scale.")
     return rest, None if still else matrices @ np.linalg.inv(rest)
 
@@ -107,6 +108,8 @@ def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIB
     number of Gaussians. Raises InputError."""
     path = Path(path)
     check(asset, path)
+    if np.isnan(frame):
+        raise InputError(f"{frame}: the frame must be a number; give one.")
     if path.suffix.lower() not in (".ply", ".splat"):
         raise InputError(f"{path}: the name of a slice must end in .ply or .splat; choose one of these.")
     part = slice_at(asset, frame, cut)

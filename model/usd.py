@@ -96,6 +96,8 @@ def write_usd(
     if mode not in MODES:
         raise InputError(f"{mode}: no such mode; choose one of {', '.join(MODES)}.")
     check(asset, path)
+    if original_start is not None and not np.isfinite(original_start):
+        raise InputError(f"{original_start}: the frame at which the original starts must be a number; give one.")
     if motion is not None and not (motion.shape == (len(asset.clip.frames), 4, 4) and np.isfinite(motion).all()):
         raise InputError(f"{path}: its motion is not a finite matrix for each frame of the clip; export it again.")
     _, Sdf, _, _, UsdUtils, _ = pxr()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..datagen.sequence import InputError
-from .asset import SH_C0, STATIC_SIGMA_T, Asset, Clip, check
+from .asset import LONGEST, SH_C0, STATIC_SIGMA_T, Asset, Clip, check
 from .formats import MOST, SHARE
 from .slices import apart, placed
 
@@ -20,7 +21,6 @@ SPLAT = "ParticleField3DGaussianSplat"
 SH = "radiance:sphericalHarmonicsCoefficients"
 VARIANTS = "representation"  # the variant set of files that hold the original object too
 RECONSTRUCTION, ORIGINAL = "reconstruction", "original"
-LONGEST = 100_000  # frames; more than an hour, and less than a damaged file may claim
 
 
 def pxr():
@@ -112,6 +112,9 @@ def _read(path: Path) -> tuple[Asset, np.ndarray | None]:
     ours = bool(found)
     found = found or [p for p in prims(stage) if p.GetTypeName() == SPLAT]
     if not found:
+        for error in stage.GetCompositionErrors():
+            if lost := re.search(r"Could not open asset @(.+?)@", str(error)):
+                raise InputError(f"{path}: it refers to {lost[1]}, which cannot be opened; find that file.")
         raise InputError(f"{path}: no prim is a {SPLAT} or has primvars:gs4d:*; choose a USD file with splats.")
     if len(found) > 1:
         names = ", ".join(str(p.GetPath()) for p in found[:3]) + (", …" if len(found) > 3 else "")
@@ -148,7 +151,7 @@ def _read_4d(path: Path, stage, prim) -> Asset:
     rgb = prim.HasAttribute("primvars:gs4d:rgb")
     rgb = get("primvars:gs4d:rgb") if rgb else 0.5 + SH_C0 * get(SH, f"{SH}h").astype(np.float64)
     rotation = get("orientations", "orientationsh", "primvars:gs4d:rotation")[:, [3, 0, 1, 2]]
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    rotation = _unit(rotation)
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     if prim.HasAttribute("gs4d:time"):
         start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # one sample, where the clip is one frame
@@ -172,6 +175,11 @@ def _read_4d(path: Path, stage, prim) -> Asset:
     )
 
 
+def _unit(quaternion: np.ndarray) -> np.ndarray:
+    with np.errstate(all="ignore"):  # `check` names what is damaged
+        return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
 def _read_others(path: Path, stage, prim) -> Asset:
     names = ("positions", "scales", "orientations", "opacities", SH)
     attributes = [prim.GetAttribute(k) for n in names for k in (n, f"{n}h")]
@@ -188,8 +196,7 @@ def _read_others(path: Path, stage, prim) -> Asset:
             raise InputError(f"{path}: it has more than {MOST:,} Gaussians over its frames; export fewer frames.")
         if n == 0 or len(sh) == 0 or len(sh) % n or quaternion.ndim != 2:
             raise InputError(f"{path}: {len(sh)} SH coefficients cannot belong to {n} splats; export it again.")
-        with np.errstate(invalid="ignore", divide="ignore"):  # `check` names what is damaged
-            rotation = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))[:, [3, 0, 1, 2]]
+        rotation = _unit(quaternion)[:, [3, 0, 1, 2]]
         parts.append({
             "xyz": xyz,
             "t": np.full(n, clip.frame_to_time(frame), np.float32),

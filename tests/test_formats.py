@@ -22,8 +22,10 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model import formats, slices
 from timesplat.model.asset import (
     ARRAYS,
+    GAUSSIAN_3D,
     SH_C0,
     STATIC_SIGMA_T,
+    TIME_4D,
     VISIBLE,
     Asset,
     Clip,
@@ -384,9 +386,24 @@ MESH += b"end_header\n0\n"
 CLOUD = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
 
 
+def ours(**values) -> bytes:
+    """One Gaussian in a .ply of ours whose comments say something else."""
+    meta = {"version": 1, "fps": 24, "frame_start": 0, "frame_end": 9, "scale": 1, "translation": "0 0 0"} | values
+    head = ["ply", "format binary_little_endian 1.0", *(f"comment timesplat {k} {v}" for k, v in meta.items())]
+    head += ["element vertex 1", *(f"property float {p}" for p in GAUSSIAN_3D + TIME_4D), "end_header", ""]
+    return "\n".join(head).encode() + bytes(76)
+
+
 @pytest.mark.parametrize(
     ("name", "data", "what"),
     [
+        ("a.ply", ours(frame_end=60_000), "frames run from 0 to 60000, which is too many"),
+        ("a.ply", ours(frame_start=-9_999_999_999, frame_end=-9_999_999_999), "too many or too far"),
+        ("a.ply", ours(fps="1e300"), "fps and scale must be positive"),
+        ("a.ply", ours(scale="1e-300"), "fps and scale must be positive"),
+        ("a.ply", ours(translation="0 0 1e39"), "these and translation finite"),
+        ("a.ply", ours(frame_end="9" * 5000), "the clip's comments are damaged"),
+        ("a.ply", ours().replace(b"format", b"farmat"), "the header is damaged (it names no format)"),
         ("a.ply", PNG, "it is a PNG picture, not a Gaussian splat .ply"),
         ("a.ply", MESH, "it is a polygon mesh, not Gaussians"),
         ("a.ply", CLOUD, "it is a plain point cloud, not Gaussians"),
@@ -424,27 +441,35 @@ def test_a_wrong_file_gets_a_sentence(tmp_path, name, data, what):
 
 
 @pytest.mark.parametrize("suffix", formats.SUFFIXES)
-def test_no_file_and_a_folder(tmp_path, suffix):
+def test_no_file_and_a_folder(tmp_path, suffix, monkeypatch):
     with pytest.raises(InputError, match="no such file"):
         formats.read(tmp_path / f"a{suffix}")
     (tmp_path / f"b{suffix}").mkdir()
     with pytest.raises(InputError, match="it is a folder"):
         formats.read(tmp_path / f"b{suffix}")
 
+    def full(path):
+        raise MemoryError
+
+    for name in ("_read_any_ply", "_read_splat", "_read_spz"):
+        monkeypatch.setattr(formats, name, full)
+    with pytest.raises(InputError, match="it takes more memory than there is"):
+        formats.read(tmp_path / f"a{suffix}")
+
 
 def test_a_decompression_bomb_is_not_unpacked(tmp_path):
-    """200 MB of zeros behind a header that announces ten Gaussians, or more than there are."""
+    """200 MB of zeros behind a header that announces ten Gaussians, or as many as that; or more than there are."""
     path = tmp_path / "a.spz"
-    for count in (10, 19_000_000):
+    for count, size in ((10, 1 << 20), (9_999_999, 1 << 20), (9_999_999, 1 << 12), (90_000, 1 << 12)):
         with gzip.open(path, "wb", 1) as f:
             f.write(struct.pack("<4sIIBBBB", b"NGSP", 3, count, 0, 12, 0, 0))
             for _ in range(200):
-                f.write(bytes(1 << 20 if count == 10 else 1 << 12))
+                f.write(bytes(size))
         tracemalloc.start()
         if count == 10:
             assert len(formats.read(path).asset) == 10
         else:
-            with pytest.raises(InputError, match="19000000 Gaussians were announced"):
+            with pytest.raises(InputError, match=f"{count} Gaussians were announced"):
                 formats.read(path)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()

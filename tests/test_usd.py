@@ -395,6 +395,10 @@ def test_moving_splats_of_another_program_live_for_a_frame_each(tmp_path):
         (lambda stage, prim: [x.Set((0, 1, f), f) for x in [UsdGeom.Xformable(prim).AddTranslateOp()]
                               for f in (2, 3e6)], "its frames run from 2 to 3e+06"),
         (lambda stage, prim: UsdGeom.SetStageMetersPerUnit(stage, -1), "its metersPerUnit is -1"),
+        (lambda stage, prim: UsdGeom.SetStageMetersPerUnit(stage, 1e200), "/scan is scaled to nothing"),
+        (lambda stage, prim: stage.SetTimeCodesPerSecond(1e300), "fps and scale must be positive"),
+        (lambda stage, prim: stage.RemovePrim("/scan") and stage.DefinePrim("/x").GetPayloads().AddPayload("no.usd"),
+         "it refers to no.usd, which cannot be opened"),
         (lambda stage, prim: UsdGeom.SetStageMetersPerUnit(stage, float("nan")), "its metersPerUnit is nan"),
         (lambda stage, prim: [prim.GetAttribute("positions").Set([(0, 0, 0)] * 3, f) for f in (0, 1e9)],
          "its frames run from 0 to 1e+09"),

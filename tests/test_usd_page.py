@@ -307,6 +307,8 @@ def test_the_original_lies_over_the_reconstruction(tmp_path, fox, suffix, packed
 
 def test_an_original_that_counts_from_another_frame(tmp_path, fox):
     scene = make_original(tmp_path)
+    with pytest.raises(InputError, match="nan: the frame at which the original starts must be a number"):
+        write_usd(tmp_path / "a.usdc", fox, original=scene, original_start=float("nan"))
     write_usd(tmp_path / "a.usdc", fox, original=scene, original_start=10)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("original")
