@@ -25,19 +25,23 @@ from . import process
 
 
 def start(module: str, request: dict, folder: Path) -> process.Child:
-    """Saves a copy of the open file into the folder (nothing of the session changes, not its name either) and starts
-    `timesplat.<module>` on it, with the open scene and view layer. Raises InputError where the copy cannot be
-    written."""
+    """Saves a copy of the open file and of its caches into the folder (nothing of the session changes, not its name
+    either) and starts `timesplat.<module>` on it, with the open scene and view layer. Raises InputError where the copy
+    cannot be written."""
     blend = folder / "scene.blend"
+    opened = Path(bpy.data.filepath)
+    caches = opened.parent / f"blendcache_{opened.stem}"  # where Blender looks for physics that is kept on the disk
     try:
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), copy=True, compress=False, relative_remap=True)
-    except RuntimeError as e:
+        if opened.name and caches.is_dir():  # copied, for what is not baked is written there
+            shutil.copytree(caches, folder / f"blendcache_{blend.stem}")
+    except (RuntimeError, OSError) as e:
         full = shutil.disk_usage(folder).free < 1 << 20  # Blender says "no such file" then
         why = "no space is left on the disk; make room there" if full else " ".join(str(e).split())
         raise InputError(f"{blend}: the copy to render from cannot be written: {why}.") from None
     request = request | {
         "blend": str(blend),
-        "name": Path(bpy.data.filepath).name,
+        "name": opened.name,
         "scripts": not bpy.app.autoexec_fail,  # whether those in the file may run: as here
         "scene": bpy.context.scene.name,
         "layer": bpy.context.view_layer.name,

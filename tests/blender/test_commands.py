@@ -76,3 +76,26 @@ def test_what_cannot_be_done(command, tmp_path):
         got, said = command(*args)
         assert got == code and word in said and "Traceback" not in said, (args, got, said)
     assert not (tmp_path / "s").exists()
+
+
+BAKED = """
+import shutil
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.mesh.primitive_cube_add(size=2)
+cache = bpy.context.object.modifiers.new("c", "CLOTH").point_cache
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+cache.use_disk_cache, cache.frame_end = True, 13
+with bpy.context.temp_override(point_cache=cache):
+    bpy.ops.ptcache.bake(bake=True)
+bpy.context.scene.frame_start = bpy.context.scene.frame_end = 13
+bpy.ops.wm.save_mainfile()
+tell(caches=[x for x in os.listdir(os.path.dirname(sys.argv[1])) if x.startswith("blendcache_")])
+"""
+
+
+def test_a_cache_on_the_disk_is_found(command, installed, tmp_path):
+    """Blender looks for it in a folder that has the file's name."""
+    assert installed(BAKED, tmp_path / "scene.blend")["caches"] == ["blendcache_scene"]
+    code, said = command("render", "--out", tmp_path / "s", "--size", 16, "--samples", 1)
+    assert code == 0, said
+    assert read_sequence(tmp_path / "s").normalisation.translation[2] < -0.3
