@@ -57,7 +57,12 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
-        process.ask(python, request)
+        try:
+            process.ask(python, request)
+        except InputError as e:
+            if not str(e).startswith("The process "):
+                raise  # it named the file
+            raise InputError(f"{path}: the USD library gave up on it; it is damaged, export it again. {e}.") from None
         return formats.Loaded(read_ply(copy), "Z"), np.load(moves) if moves.exists() else None
 
 

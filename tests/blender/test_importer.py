@@ -119,6 +119,13 @@ for key in ["worker", "direct"] if find("pxr") else ["worker"]:
     part("model.asset").write_ply(sys.argv[3] + key + ".ply", got.asset)
     result[key + "_bad"] = load(filepath=sys.argv[2])
     result[key + "_none"] = load(filepath=sys.argv[2] + "c.usdc")
+os.environ["TIMESPLAT_PYTHON"] = named
+worker = importer.process.ask
+def crash(python, request):
+    raise part("datagen.sequence").InputError("The process was ended by signal 11: it said nothing")
+importer.process.ask = crash
+result["crash"] = load(filepath=sys.argv[1])
+importer.process.ask = worker
 os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
 importlib.util.find_spec = hidden
 result["python"] = load(filepath=sys.argv[1])
@@ -143,6 +150,7 @@ tell(**result, left=os.listdir(os.environ["TMPDIR"]))
         assert "damaged or not a USD file" in told[f"{key}_bad"]["error"]
         assert "no such file" in told[f"{key}_none"]["error"]
     assert "no such file" in told["python"]["error"] and "one by one" in told["two"]["error"]
+    assert "a.usdz: the USD library gave up on it; it is damaged" in told["crash"]["error"]
     assert told["full"]["error"] == "/full/x: it cannot be written (No space left on device); make room."
     assert not [n for n in told["left"] if n.startswith("timesplat-")]
 
