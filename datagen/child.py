@@ -52,6 +52,8 @@ def run_job(job: dict, say: Callable[[dict], None]) -> None:
         frames = clip.frames(settings.frames)
         if settings.displace:
             frames = frames[:1] * settings.frames
+        if not clip.actions:
+            scene.simulate(frames[-1])
         norm, aabb = scene.normalisation(frames, name=asset)
         # every clip of every object gets cameras of its own
         seed = zlib.crc32(f"{settings.seed}/{stem(asset)}/{clip.name}".encode())
