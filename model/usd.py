@@ -183,6 +183,8 @@ def _unpacked(original: Path, folder: Path) -> Path:
         with zipfile.ZipFile(original) as z:
             if any(i.compress_type != zipfile.ZIP_STORED for i in z.infolist()):
                 raise ValueError("it is compressed")
+            if sum(i.file_size for i in z.infolist()) > original.stat().st_size:
+                raise ValueError("its files overlap")
             z.extractall(folder / "original")  # keeps inside of the folder
             return folder / "original" / z.namelist()[0]
     except (zipfile.BadZipFile, ValueError, IndexError) as e:

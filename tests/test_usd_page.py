@@ -2,10 +2,12 @@
 """docs/pipelines.md does what it says: its commands, its Python, its snippets of USD; under usd-core, under the
 older pxr inside of the bpy wheel, in Blender's importer and in a reader that is not OpenUSD."""
 
+import copy
 import json
 import re
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pxr")
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
 from timesplat.cli import main
 from timesplat.datagen.sequence import InputError
@@ -278,8 +280,6 @@ def test_the_original_lies_over_the_reconstruction(tmp_path, fox, suffix, packed
     (tmp_path / "in").mkdir()
     original = make_original(tmp_path / "in")
     if packed:
-        from pxr import UsdUtils
-
         assert UsdUtils.CreateNewUsdzPackage(str(original), str(original.with_suffix(".usdz")))
         original = original.with_suffix(".usdz")
     out = tmp_path / "out" / f"a{suffix}"
@@ -364,6 +364,14 @@ def test_originals_that_cannot_be_used(tmp_path, fox):
     refused(scene, "no default prim")
     (tmp_path / "bad.usdz").write_bytes(b"PK\x03\x04 and so on")
     refused(tmp_path / "bad.usdz", "damaged")
+    bomb = tmp_path / "bomb.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(str(make_original(tmp_path)), str(bomb))
+    with zipfile.ZipFile(bomb, "a") as z:  # the same bytes under many names
+        for k in range(50):
+            z.filelist.append(copy.copy(z.filelist[0]))
+            z.filelist[-1].filename = f"{k}.usda"
+        z._didModify = True
+    refused(bomb, "its files overlap")
 
 
 def test_a_variant_whose_original_is_gone_is_complained_of(tmp_path, fox):
