@@ -185,8 +185,9 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
     """A throw-away copy of the open scene with one view layer, to change and to step through at will.
 
     objects: what it contains; None = all that renders show; lights False leaves light objects out. Cameras are left
-    out, and so is Grease Pencil, which has no depth. Without a window the copy stands in for the scene wherever this
-    is referred to: a driver that reads the scene's frame would stand still otherwise.
+    out, and so are Grease Pencil, which has no depth, and shadow catchers, which are no things. Without a window
+    the copy stands in for the scene wherever this is referred to: a driver that reads the scene's frame would stand
+    still otherwise.
     On leaving, the copy is gone and the scene's own frame is evaluated again.
     """
     source, layer = bpy.context.scene, bpy.context.view_layer
@@ -200,7 +201,7 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
         for ob in list(stage.collection.objects):
             stage.collection.objects.unlink(ob)
         for ob in keep:
-            if ob.type not in _LEFT_OUT and (lights or ob.type != "LIGHT"):
+            if lights if ob.type == "LIGHT" else ob.type not in _LEFT_OUT and not ob.is_shadow_catcher:
                 stage.collection.objects.link(ob)
         stage.timeline_markers.clear()  # those with a camera would switch to it
         stage.background_set = None

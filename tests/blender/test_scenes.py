@@ -142,6 +142,7 @@ still("units and names", "scene.unit_settings.scale_length = 0.01; box('Ключ
 still("disabled in the viewport", "box().hide_viewport = True; box('dot', size=0.1)")
 still("hidden by hand", "box().hide_set(True); box('dot', size=0.1)")
 still("invisible to cameras", "box(); box('blocker', (0, 0, 40)).visible_camera = False")
+still("a shadow catcher", "box(); box('floor', (0, 0, -21), 40).is_shadow_catcher = True")
 still(
     "text",
     "t = bpy.data.curves.new('t', 'FONT'); add('t', t); t.body, t.extrude = 'I', 1",
