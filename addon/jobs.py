@@ -15,6 +15,7 @@ import itertools
 import os
 import shutil
 import tempfile
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -112,7 +113,11 @@ class Job:
         self._log = self.log_text()
         said = message if state == "done" else f"{self._kept} {message}".strip()
         self.child, self.state, self.message, self.text = None, state, said, ""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for _ in range(10):
+            shutil.rmtree(self.folder, ignore_errors=True)
+            if not self.folder.exists():
+                break
+            time.sleep(0.05)  # what was killed may be in the middle of its last write
 
     def log_text(self) -> str:
         """All that its processes wrote, or the beginning and the end of it."""

@@ -251,6 +251,28 @@ tell(labels=labels, state=state(), first=first, session=session)
     clean(told)
 
 
+def test_what_is_written_while_the_folder_goes_is_removed_too(installed):
+    """A killed process that waits for the disk may end a moment later than those that waited for it."""
+    told = installed(
+        HEAD
+        + f"""
+sleeper = [{sys.executable!r}, "-c", "import time; time.sleep(999)"]
+job = jobs.start("x", [lambda folder: process.Child(sleeper, {{}}, folder)])
+remove, late = os.rmdir, []
+def rmdir(path, **options):
+    if os.path.basename(path) == job.folder.name and not late:
+        late.append(path)
+        (job.folder / "late").touch()
+    remove(path, **options)
+os.rmdir = rmdir
+job.cancel()
+tell(late=len(late), state=state(), first=first, session=session)
+"""
+    )
+    assert told["late"] == 1
+    clean(told)
+
+
 def test_what_goes_wrong_on_our_side_ends_the_job_and_not_the_timer(installed):
     told = installed(
         HEAD
