@@ -276,7 +276,8 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         else:
             level, said = self.write_usd(path, place(asset, rest), None, motion, context)
         if lost:
-            said += f" Animated, but in the file as at frame {frame:g}: {', '.join(lost)}; 3DGS PLY, all frames, moves."
+            said += f" Animated, but in the file as at frame {frame:g}: {', '.join(lost)}."
+            said += " 3DGS PLY, all frames, keeps it."
         return "WARNING" if lost else level, said
 
     def write_usd(self, path: Path, asset: Asset, original: Path | None, motion, context) -> tuple[str, str]:

@@ -206,7 +206,7 @@ tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)),
         np.testing.assert_allclose(got.xyz, np.stack([want[:, 0], -want[:, 2], want[:, 1]], 1), atol=2e-5)
     assert len(counts) > 10 and len(os.listdir(folder / "frames")) == 33
     if repeat == "Hold":
-        animated = "Animated, but in the file as at frame 20.5: Opacity Cut, Density, place;"
+        animated = "Animated, but in the file as at frame 20.5: Opacity Cut, Density, place."
         assert told["said"][-1][0] == "WARNING" and animated in told["said"][-1][1]
     else:
         assert f"Repeat is {repeat}" in told["refused"] and "export 3DGS PLY, all frames" in told["refused"]
@@ -239,7 +239,7 @@ tell(done=done, want=want, got=got, said=said, keyed=bool(bpy.context.object.ani
 """
     told = blender(EXPORT + TIMELINE + code, folder, env={"TIMESPLAT_PYTHON": sys.executable})
     assert told["done"] == [["FINISHED"]] * 8 and not told["keyed"]
-    assert "Animated, but in the file as at frame 20: place;" in told["said"][0][1]
+    assert "Animated, but in the file as at frame 20: place." in told["said"][0][1]
     assert [level for level, _ in told["said"][1:]] == ["INFO"] * 5 and "valid USD" in told["said"][1][1]
     asset = read_ply(folder / "in.ply")
     for name in ("a.usdz", "b.usda", "c.usdc", "again.usdc"):
