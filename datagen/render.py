@@ -165,7 +165,8 @@ def expand(assets: list[str]) -> list[str]:
     for asset in map(str, assets):
         path = Path(asset)
         if path.is_dir():
-            inside = sorted(str(p) for p in path.rglob("*") if p.suffix.lower() in ASSET_SUFFIXES)
+            files = [Path(root, name) for root, _, names in os.walk(path) for name in names]
+            inside = sorted(str(f) for f in files if f.suffix.lower() in ASSET_SUFFIXES)
             if not inside:
                 raise InputError(f"{path}: there is no asset in this folder; {', '.join(ASSET_SUFFIXES)} are read.")
             found += inside

@@ -112,6 +112,22 @@ def test_the_zoo(tmp_path):
     assert all(np.array_equal(read_sequence(a[0]).load_image(i), b.load_image(i)) for i in range(4))
 
 
+def test_folders_may_go_while_assets_are_looked_for(tmp_path, monkeypatch):
+    """Such as the hidden one in which another process renders."""
+    for name in ("a.glb", "b/c.FBX", ".half/d.blend", "b/notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    look = os.scandir
+
+    def scandir(path):
+        if os.path.basename(path) == ".half":
+            raise FileNotFoundError(path)
+        return look(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert render.expand([str(tmp_path)]) == [str(tmp_path / "a.glb"), str(tmp_path / "b" / "c.FBX")]
+
+
 def test_two_assets_of_one_name(assets, tmp_path):
     (tmp_path / "still.glb").write_bytes((assets / "still.glb").read_bytes())
     both = [str(assets / "still.glb"), str(tmp_path / "still.glb")]
