@@ -252,7 +252,10 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         frame = scene.frame_current_final
         if self.format in ("SLICE", "SPLAT"):
             part = held.moment(ob, held.asset_of(ob), frame, self.apply_sliders)
-            return "INFO", f"{slices.write_slice(path, part, frame, cut=0)} Gaussians of frame {frame:g}."
+            count = slices.write_slice(path, part, frame, cut=0)
+            if not part.opacity.any():
+                return "WARNING", f"Nothing is shown at frame {frame:g}; one clear Gaussian stands in."
+            return "INFO", f"{count} Gaussians of frame {frame:g}."
         if self.format == "SLICES":
             asset = held.asset_of(ob)
             frames = range(scene.frame_start, scene.frame_end + 1) if self.apply_sliders else asset.clip.frames

@@ -189,6 +189,9 @@ scene.frame_start, scene.frame_end = 8, 40
 scene.frame_set(20, subframe=0.5)
 done, now = save("frames", format="SLICES"), scene.frame_current_final
 one = save("one.ply", format="SLICE"), world()
+scene.frame_set(36)
+save("none.splat")
+scene.frame_set(20, subframe=0.5)
 tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)), said=said)
 """
     told = blender(EXPORT + TIMELINE + code, folder)
@@ -204,6 +207,7 @@ tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)),
         counts.add(len(want))
         want = np.array(want)
         np.testing.assert_allclose(got.xyz, np.stack([want[:, 0], -want[:, 2], want[:, 1]], 1), atol=2e-5)
+    assert told["said"][2] == ["WARNING", "Nothing is shown at frame 36; one clear Gaussian stands in."]
     assert len(counts) > 10 and len(os.listdir(folder / "frames")) == 33
     if repeat == "Hold":
         animated = "Animated, but in the file as at frame 20.5: Opacity Cut, Density, place."
