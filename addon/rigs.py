@@ -80,8 +80,11 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
         for ob in list(context.view_layer.objects.selected):
             ob.select_set(False)
         if self.replace and (old := bpy.data.collections.get(settings.RIG)):
-            data = [o.data for o in old.objects if o.type == "CAMERA" and o.data.users == 1]
-            bpy.data.batch_remove([o for o in old.objects if o.type == "CAMERA"] + data)
+            for ob in [o for o in old.objects if o.type == "CAMERA"]:  # batch_remove crashes 4.3 when it is undone
+                data = ob.data
+                bpy.data.objects.remove(ob)
+                if not data.users:
+                    bpy.data.cameras.remove(data)
         collection = bpy.data.collections.get(settings.RIG) or bpy.data.collections.new(settings.RIG)
         if settings.RIG not in scene.collection.children:
             scene.collection.children.link(collection)

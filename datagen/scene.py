@@ -87,8 +87,10 @@ def open_asset(path: Path) -> Asset:
 
 def object_mode() -> None:
     """Leaves the mode that the file was saved in: a mesh in Edit Mode is neither measured nor rendered."""
-    if bpy.context.mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
+    active = bpy.context.view_layer.objects.active
+    if active and active.mode != "OBJECT":  # a command of Blender's command line has no window in its context
+        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+            bpy.ops.object.mode_set(mode="OBJECT")
 
 
 class _KeepRestPose:
@@ -188,7 +190,8 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
     out, and so are Grease Pencil, which has no depth, and shadow catchers, which are no things. Without a window
     the copy stands in for the scene wherever this is referred to: a driver that reads the scene's frame would stand
     still otherwise.
-    On leaving, the copy is gone and the scene's own frame is evaluated again.
+    On leaving, the copy is gone and, without a window, the scene's own frame is evaluated again. With one it was never
+    touched, and an artist's pose that has no key yet would be lost.
     """
     source, layer = bpy.context.scene, bpy.context.view_layer
     keep = shown_objects(source, layer) if objects is None else list(objects)
@@ -212,7 +215,8 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
         if bpy.app.background:
             stage.user_remap(source)
         bpy.data.scenes.remove(stage)
-        source.frame_set(source.frame_current, subframe=source.frame_subframe)
+        if bpy.app.background:
+            source.frame_set(source.frame_current, subframe=source.frame_subframe)
 
 
 def simulate(last: int) -> None:

@@ -319,6 +319,37 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
     assert list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*")) == []
 
 
+def test_a_rig_is_put_and_undone_while_the_view_renders(window, tmp_path):
+    """Blender 4.3 crashed at the next undo when a scene was made for measuring; and a pose without a key was lost."""
+    with window(tmp_path / "monkey.blend", TIMESPLAT_PYTHON=sys.executable) as w:
+        region = w.sidebar()
+        view = w.area("VIEW_3D")
+        rig = "[o.name for o in bpy.data.objects if o.type == 'CAMERA']"
+        across = region["x"] + 0.25 * (region["w"] - 28)
+        button = w.find("rig='CANONICAL'", across, 300, region["y"] + region["h"], step=8)
+
+        def over_the_view(*keys: str) -> None:
+            w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
+            time.sleep(0.7)
+            w.key(*keys)
+
+        place = "list(bpy.data.objects['Suzanne'].location)"
+        over_the_view("g", "x", "1", "Return")
+        w.wait_for(f"{place}[0] > 0.9")
+        moved = w.ask(place)
+        over_the_view("z", "8")
+        areas = "bpy.context.window_manager.windows[0].screen.areas"
+        w.wait_for(f"any(a.type == 'VIEW_3D' and a.spaces.active.shading.type == 'RENDERED' for a in {areas})")
+        for i in range(5):
+            w.click(across, button)
+            w.wait_for(f"len({rig}) == 4")
+            assert w.ask(place) == moved
+            w.picture(f"rig {i}")
+            over_the_view("ctrl+z")
+            w.wait_for(f"len({rig}) == 0")
+            w.wait_for("bpy.context.view_layer.update() is None")
+
+
 def test_files_that_are_dropped_on_the_view(window, tmp_path):
     """From another program, as XDND: an asset, two files as a sequence, USD, and one that is no PLY."""
     xdnd = pytest.importorskip("tests.blender.xdnd", reason="python-xlib is not installed", exc_type=ImportError)
