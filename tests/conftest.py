@@ -25,6 +25,15 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_weights(tmp_path_factory):
+    """Weights of VGG and LPIPS that the user may have are not there; tests of them bring their own."""
+    with pytest.MonkeyPatch.context() as m:
+        m.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch")))
+        m.delenv("TIMESPLAT_WEIGHTS", raising=False)
+        yield
+
+
 @pytest.fixture
 def steady_clock(monkeypatch):
     """A fit of so many seconds takes as many steps on every machine: each look at its clock is 10 ms later."""
