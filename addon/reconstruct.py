@@ -109,7 +109,7 @@ def start(chosen, context) -> jobs.Job:
     captured = [o for o in settings.objects(chosen, context) if o.type not in ("LIGHT", "CAMERA")]
     known = {o.session_uid for o in captured}  # names may change while it runs
     roots = [o for o in captured if o.parent not in captured]
-    root, there = (roots[0].session_uid, _pose(roots[0]).inverted(None)) if len(roots) == 1 else (0, None)
+    root, pose = (roots[0].session_uid, _pose(roots[0])) if len(roots) == 1 else (0, Matrix.Scale(0, 4))
 
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
@@ -119,8 +119,8 @@ def start(chosen, context) -> jobs.Job:
         originals = {o.session_uid: o for o in bpy.context.scene.objects if o.session_uid in known}
         ob["timesplat_source"] = [o.name for o in originals.values()]
         ob["timesplat_lighting"] = shot["lighting"]
-        if there and root in originals and display.follow(ob, originals[root]):
-            ob.matrix_parent_inverse = there  # it may have been moved since
+        if pose.determinant() and root in originals and display.follow(ob, originals[root]):
+            ob.matrix_parent_inverse = pose.inverted()  # it may have been moved since
         said = f"{len(asset)} Gaussians in {time.monotonic() - begun:.0f} s"
         if output:
             try:
