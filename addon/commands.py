@@ -58,9 +58,11 @@ def main(argv: list[str]) -> int:
     for key in settings.KEYS:
         if getattr(args, key, None) is not None:
             setattr(chosen, key, getattr(args, key))
-    object_mode()
+    window = bpy.context.window_manager.windows[0]
     try:
-        _render(chosen, args) if args.command == "render" else _reconstruct(chosen, args)
+        with bpy.context.temp_override(window=window):  # a command has none, and operators find no object without
+            object_mode()
+            _render(chosen, args) if args.command == "render" else _reconstruct(chosen, args)
     except InputError as e:
         print(f"timesplat: {e}", file=sys.stderr)
         return 2

@@ -87,10 +87,8 @@ def open_asset(path: Path) -> Asset:
 
 def object_mode() -> None:
     """Leaves the mode that the file was saved in: a mesh in Edit Mode is neither measured nor rendered."""
-    active = bpy.context.view_layer.objects.active
-    if active and active.mode != "OBJECT":  # a command of Blender's command line has no window in its context
-        with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
-            bpy.ops.object.mode_set(mode="OBJECT")
+    if bpy.context.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
 
 
 class _KeepRestPose:

@@ -56,14 +56,23 @@ def test_render(command, tmp_path):
     np.testing.assert_allclose(seq.normalisation.translation, [3, 0, 0], atol=1e-5)
 
 
-def test_reconstruct(command, tmp_path):
+RESULT = """
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+ob = bpy.data.objects["Timesplat"]
+tell(kind=ob.type, clouds=part("addon.display").has_point_clouds(),
+     active=bpy.context.view_layer.objects.active == ob)
+"""
+
+
+def test_reconstruct(command, installed, tmp_path):
     pytest.importorskip("torch")
     options = ["--method", "lift", "--size", 32, "--samples", 1, "--budget", "ALL", "--refine", 0]
     code, said = command("reconstruct", *options, "--output", tmp_path / "a.ply", "--blend", tmp_path / "a.blend")
     assert code == 0 and "Gaussians in" in said and "%" in said, said
     asset = read_ply(tmp_path / "a.ply")
     assert len(asset) > 100 and (asset.clip.frame_start, asset.clip.frame_end) == (1, 4)
-    assert (tmp_path / "a.blend").stat().st_size > 1e5
+    told = installed(RESULT, tmp_path / "a.blend")
+    assert told["active"] and told["kind"] == ("POINTCLOUD" if told["clouds"] else "MESH")
 
 
 def test_what_cannot_be_done(command, tmp_path):
