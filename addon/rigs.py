@@ -66,6 +66,7 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
+        cls.poll_message_set("Cameras are added in Object Mode; leave the mode that you are in.")
         return context.mode == "OBJECT"
 
     def execute(self, context):
