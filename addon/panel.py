@@ -85,6 +85,10 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
             about = "at most" if chosen.budget == "NUMBER" else "about"
             col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
+        if not preferences.named(context):
+            row = layout.row(align=True)
+            row.label(text="No runtime yet", icon="ERROR")
+            row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = preferences.ROOT
         row = layout.row()
         row.scale_y = 1.5
         _reconstruct(row, chosen)

@@ -24,6 +24,7 @@ DEVICES = [
     ("mps", "Metal", "A GPU of Apple"),
 ]
 _installed: dict | None = None  # what the runtime's own file says, read once and when a Job has changed it
+_has_torch = importlib.util.find_spec("torch") is not None  # Blender's own Python; this looks and does not import
 
 
 class TIMESPLAT_preferences(bpy.types.AddonPreferences):
@@ -112,12 +113,18 @@ def worker_python(context=None) -> str:
             if not Path(path).is_file():
                 raise InputError(f"{path}: no such file; {remedy}.")
             return path
-    if importlib.util.find_spec("torch"):  # looks, does not import
+    if _has_torch:
         return sys.executable
     raise InputError(
         "No Python with torch is known: press Install Runtime in Timesplat's preferences, or name there a Python "
         "that has timesplat[torch]."
     )
+
+
+def named(context=None) -> bool:
+    """Whether any Python for the worker is known. For draw functions: it reads no files."""
+    preferences = get(context)
+    return bool((preferences and preferences.python) or _installed or os.environ.get("TIMESPLAT_PYTHON") or _has_torch)
 
 
 def usd_python(context=None) -> str | None:

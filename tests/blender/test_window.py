@@ -101,6 +101,8 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         w.key("ctrl+o")
         w.choose(tmp_path / "monkey.blend")
         w.wait_for("bpy.data.filepath and len(bpy.data.objects) == 1")
+        side = w.sidebar()
+        w.find("preferences.addon_show", side["x"] + 0.75 * (side["w"] - 28), 100, 300)  # until there is a runtime
         w.preferences(sys.executable)
         assert w.ask("ours('addon.preferences').get().python") == sys.executable
 
