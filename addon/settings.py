@@ -19,7 +19,7 @@ SHAPES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINT
 METHODS = [
     ("guided", "Guided", "The network, led by depth and motion that Blender renders along"),
     ("lift", "Lift", "Depth and motion straight to Gaussians, without a network: fastest"),
-    ("rgb", "Pictures only", "The network from colour alone, as it would be for photographs"),
+    ("rgb", "Pictures Only", "The network from colour alone, as it would be for photographs"),
 ]
 BUDGETS = [
     ("ALL", "All", "Every Gaussian that was predicted"),
