@@ -65,7 +65,10 @@ def serve(do: Callable[[dict, Callable], dict]) -> NoReturn:
         say("progress", fraction=fraction, text=text)
 
     request = json.loads(sys.stdin.readline())
-    threading.Thread(target=_leave_when_stdin_closes, daemon=True).start()
+    pipe = os.dup(0)
+    with open(os.devnull) as nothing:
+        os.dup2(nothing.fileno(), 0)  # on Windows what inherits a pipe that is being read hangs (cpython #78961)
+    threading.Thread(target=_leave_when_closed, args=[pipe], daemon=True).start()
     code = 1
     try:
         progress(0.0, "opening the scene")
@@ -86,7 +89,7 @@ def serve(do: Callable[[dict, Callable], dict]) -> NoReturn:
     os._exit(code)  # Blender's own way out is slow
 
 
-def _leave_when_stdin_closes() -> None:
-    while sys.stdin.readline():
+def _leave_when_closed(pipe: int) -> None:
+    while os.read(pipe, 1 << 16):
         pass
     os._exit(3)

@@ -64,7 +64,8 @@ def keep(ob, mask: np.ndarray, context=None) -> None:
     name = old.name
     old.user_remap(new)
     bpy.data.objects.remove(helper)
-    bpy.data.batch_remove([old])
+    # not batch_remove: undo after it has crashed Blender 4.3
+    (bpy.data.meshes if isinstance(old, bpy.types.Mesh) else bpy.data.pointclouds).remove(old)
     new.name = name
     for other in selected:
         other.select_set(True)

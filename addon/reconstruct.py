@@ -121,7 +121,7 @@ def start(chosen, context) -> jobs.Job:
         ob["timesplat_lighting"] = shot["lighting"]
         if pose.determinant() and root in originals and display.follow(ob, originals[root]):
             ob.matrix_parent_inverse = pose.inverted()  # it may have been moved since
-        said = f"{len(asset)} Gaussians in {time.monotonic() - begun:.0f} s"
+        said = f"{len(asset):,} Gaussians in {time.monotonic() - begun:.0f} s"
         if output:
             try:
                 write_ply(output, asset)

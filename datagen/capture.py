@@ -70,7 +70,8 @@ def capture(
     """Renders `shots` of the open scene and writes the Sequence `out`; returns it as read back.
 
     shots           cameras in normalised space; `Shot.frame` counts the clip's frames, 0…len(frames)-1
-    frames          the scene frame of each frame of the clip; may repeat one (a padded clip holds still)
+    frames          the scene frame of each frame of the clip, evenly apart (the clip's rate is the scene's over that);
+                    may repeat one (a padded clip holds still)
     size            pixels, an int for a square image or (width, height)
     passes          also write depth and motion vectors; `linear` adds the scene-linear picture to them
     device          Cycles' "CPU" or "GPU" (the one chosen in Blender's preferences); threads 0 = all cores
@@ -93,7 +94,7 @@ def capture(
     seq = Sequence(
         width=width,
         height=height,
-        fps=scene.render.fps / scene.render.fps_base,
+        fps=scene.render.fps / scene.render.fps_base / apart(frames),
         frame_start=0,
         frame_end=len(frames) - 1,
         normalisation=normalisation,
@@ -174,6 +175,11 @@ def straight_srgb(linear: np.ndarray) -> np.ndarray:
     rgba = np.round(np.concatenate([rgb, alpha], -1) * 255).astype(np.uint8)
     rgba[rgba[..., 3] == 0] = 0
     return rgba
+
+
+def apart(frames: list[int]) -> int:
+    """Scene frames between two frames of a clip: 1 where there is but one, or they do not go on."""
+    return max(frames[1] - frames[0], 1) if len(frames) > 1 else 1
 
 
 def _per_step(passes: Passes, frames: list[int], i: int) -> None:

@@ -347,7 +347,8 @@ def normalisation(
             check_vertices(name, part, points)
             low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
     if not np.isfinite(low).all():
-        raise InputError(f"{name}: no mesh is visible in frames {frames[0]} to {frames[-1]}; choose others.")
+        where = f"frames {frames[0]} to {frames[-1]}"
+        raise InputError(f"{name}: no mesh is visible to renders in {where}; show it there, or choose others.")
     centre, scale = (low + high) / 2, float((high - low).max() / 2)
     if not scale > 1e-9:
         raise InputError(f"{name}: all vertices lie at one point; give an object that has a size.")

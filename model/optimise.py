@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -146,6 +147,23 @@ def shrunk(views: Views, by: int) -> Views:
     return replace(views, rgb=rgb, alpha=alpha[..., 0], intrinsics=views.intrinsics / by)
 
 
+@cache
+def ready(device: str) -> None:
+    """Draws one Gaussian and takes one step, so that whoever counts seconds afterwards does not count the compiling of
+    the kernels: half a minute the first time after an installation, loading them then."""
+    with gradients():
+        picture, camera = torch.ones(1, 8, 8, 3), torch.tensor([[8.0, 8, 4, 4]])
+        views = Views(picture, picture[..., 0], torch.eye(4)[None], camera, torch.zeros(1), 1.0).to(device)
+        p = Parameters({"xyz": torch.tensor([[0, 0, 2.0]], device=device)}, {"xyz": (1e-3, 1e-3)})
+        one, three, turn = (torch.ones(1, *n, device=device) for n in ((), (3,), (4,)))
+
+        def scene() -> Gaussians4D:
+            return Gaussians4D(p["xyz"], 0 * one, 0 * three, one, three, turn, 0.5 * three, 0.5 * one)
+
+        optimise(p, scene, views, photographs, 0.0, steps=1, batch=1)
+        render(scene(), views.c2w, views.intrinsics, views.time, 8, 8, inference=True)
+
+
 def optimise(
     parameters: Parameters,
     scene: Callable[[], Gaussians4D | Moving],
@@ -179,6 +197,8 @@ def optimise(
     views = joined(views, beside) if beside else views
     small = shrunk(views, -(-max(views.size) // coarse))
     turns = Turns(0, count, generator), Turns(count, len(views), generator)
+    if steps is None:
+        ready(views.rgb.device.type)
     start, told, done = clock(), 0.0, 0
     bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
     while True:
@@ -202,8 +222,6 @@ def optimise(
         rgb, alpha = render(here, seen.c2w, seen.intrinsics, seen.time, width, height, background=behind)
         loss(Step(rgb, alpha, seen, behind, here, fraction)).backward()
         done += 1
-        if done == 1:  # it may have compiled the kernels: its time counts for nothing
-            start, told = clock(), 0.0
         if edit:
             edit(done, fraction)
         parameters.step(fraction)

@@ -37,7 +37,8 @@ WEIGHTS = {"rgb": "sweep", "gs-lrm-frame": "static", "gs-lrm-all": "static"}
 
 def clip_of(seq: Sequence) -> Clip:
     """The Clip that leads an asset of this Sequence back to its scene: at the scene's frames where these are noted and
-    lie evenly (a last one that repeats is a scene that holds still), else at the Sequence's own."""
+    lie evenly (a last one that repeats is a scene that holds still), else at the Sequence's own. Its rate is that of
+    these frames."""
     first, count = seq.frame_start, seq.frame_end - seq.frame_start + 1
     step, frames = 1, seq.provenance.get("scene_frames")
     if isinstance(frames, list) and len(frames) == count and all(type(f) is int for f in frames):
@@ -45,7 +46,7 @@ def clip_of(seq: Sequence) -> Clip:
         if apart > 0 and frames == [min(frames[0] + i * apart, frames[-1]) for i in range(count)]:
             first, step = frames[0], apart
     n = seq.normalisation
-    return Clip(seq.fps, first, first + step * (count - 1), n.scale, tuple(n.translation), pixel_size(seq))
+    return Clip(seq.fps * step, first, first + step * (count - 1), n.scale, tuple(n.translation), pixel_size(seq))
 
 
 def reconstruct(

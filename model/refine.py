@@ -26,7 +26,7 @@ from ..datagen.sequence import InputError, opengl_to_opencv
 from .baselines.four_dgs import EVERY, RATES, UNTIL, activate, densify
 from .fuse import fuse
 from .gaussians import Gaussians4D, Moving
-from .optimise import Parameters, Step, gradients, optimise, own, photographs, shrunk
+from .optimise import Parameters, Step, gradients, optimise, own, photographs, ready, shrunk
 from .rasterize import render
 from .threads import clock
 from .views import Views
@@ -95,6 +95,8 @@ def refine(
         raise InputError("Refinement is of 4D Gaussians, and this method's scene is of another kind; leave it out.")
     if (seconds == 0 and not steps) or not len(start) or (len(views) < FEWEST and not near and count is None):
         return start
+    ready(device)
+    began = clock()
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g = g[g.alive()]
@@ -114,7 +116,6 @@ def refine(
             if e < least:
                 g = better = moved
         if fusing:
-            began = clock()  # what stands before may have compiled the kernels
             most = count or limit(views, near)
             beside = around(g, views, seed) if near else None
             values, price = few(g, most, near)
@@ -122,7 +123,7 @@ def refine(
                 values,
                 RATES,
                 views,
-                max((1 - first) * seconds - (clock() - began), 0.5 * (1 - first) * seconds),
+                max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
                 beside=beside,
                 most=most,
                 price=price,

@@ -115,7 +115,7 @@ def test_a_number_of_steps_gives_the_same_on_every_run_and_seconds_end(moving, s
     torch.testing.assert_close(a.opacity, b.opacity, rtol=0, atol=0)
     told = []
     reconstruct_views(views, "4dgs", seconds=0.3, progress=lambda fraction, text: told.append((fraction, text)))
-    assert told == sorted(told) and told[-1] == (1, "4dgs, step 30")
+    assert told == sorted(told) and told[-1] == (1, "4dgs, step 29")
 
 
 def test_som_follows_what_moves(spheres):

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
+import json
+
 import bpy
 import numpy as np
 import pytest
@@ -97,6 +99,14 @@ def test_depth_and_motion_are_those_computed_by_hand(plane, tmp_path):
         assert np.abs((p.depth - z)[body].mean()) < 0.1 * slope[body].mean() + 1e-4  # and has no bias
         far = inside(~hit)
         assert np.isinf(p.depth[far]).all() and (rgba[far] == 0).all() and (rgba[body][:, 3] == 255).all()
+
+
+@pytest.mark.parametrize(("frames", "fps"), [([3, 6], 8), ([3, 3], 24), ([3], 24)])
+def test_seconds_are_those_of_the_scene(plane, tmp_path, frames, fps):
+    shots = [Shot(i, "c", "r", rigs.spherical(10, 5, 2.2)) for i in range(len(frames))]
+    cp.capture(shots, tmp_path / "s", frames=frames, normalisation=NORM, size=8, samples=1, passes=False)
+    told = json.loads((tmp_path / "s" / "transforms.json").read_text())
+    assert told["fps"] == fps and [f["seconds"] for f in told["frames"]] == [i / fps for i in range(len(frames))]
 
 
 def test_silhouette_depth_is_never_a_mixture(plane, tmp_path):

@@ -74,9 +74,10 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
 
 
 def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatch):
-    """Each step takes a second of this clock, the first, which compiles, a minute."""
+    """Each step takes a second of this clock, what makes the kernels ready a minute."""
     now, told = [0.0], []
     monkeypatch.setattr(module, "clock", lambda: now[0])
+    monkeypatch.setattr(module, "ready", lambda device: now.append(now.pop() + 60))
     one = torch.ones(1)
     with gradients():
         views = own(spheres([0, 12], size=16))
@@ -87,8 +88,17 @@ def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatc
             return Gaussians4D(0 * p["rgb"], 0 * one, 0 * p["rgb"], one, torch.ones(1, 3), turn, p["rgb"], one)
 
         def loss(step):
-            now[0] += 1 if now[0] else 60
+            now[0] += 1
             return photographs(step)
 
-        assert optimise(p, scene, views, loss, 8, progress=lambda fraction, text: told.append(fraction)) == 9
+        assert optimise(p, scene, views, loss, 8, progress=lambda fraction, text: told.append(fraction)) == 8
     assert told == [i / 8 for i in range(1, 9)]
+
+
+def test_what_compiles_the_kernels_draws_and_steps(monkeypatch):
+    drawn = []
+    draw = module.render
+    monkeypatch.setattr(module, "render", lambda *a, **k: drawn.append(draw(*a, **k)) or drawn[-1])
+    with torch.inference_mode():
+        module.ready.__wrapped__("cpu")
+    assert len(drawn) == 2 and all(alpha.max() > 0.3 for _, alpha in drawn) and drawn[0][0].requires_grad
