@@ -5,8 +5,8 @@ from importlib import import_module
 
 # In the order in which they are registered; what comes later may use what comes before.
 MODULES = (
-    *("preferences", "settings", "importer", "jobs", "setup", "rigs", "reconstruct", "commands", "panel"),
-    *("display", "edit", "compare", "exporter"),
+    *("preferences", "settings", "importer", "jobs", "setup", "rigs", "beside", "reconstruct", "commands"),
+    *("panel", "display", "edit", "compare", "exporter"),
 )
 
 

@@ -19,15 +19,25 @@ from pathlib import Path
 from typing import NoReturn
 
 import bpy
+from bpy.app.handlers import persistent
 
 from ..datagen.sequence import InputError
 from . import process
+
+_at_opening: set[str] | None = None  # the file's texts that run when it is opened, as it was then; None: not known
 
 
 def start(module: str, request: dict, folder: Path) -> process.Child:
     """Saves a copy of the open file and of its caches into the folder (nothing of the session changes, not its name
     either) and starts `timesplat.<module>` on it, with the open scene and view layer. Raises InputError where the copy
-    cannot be written."""
+    cannot be written, or would run a text that was not there when the file was opened: one that was appended, perhaps,
+    and that Blender itself has not run."""
+    scripts = not bpy.app.autoexec_fail  # whether those in the file may run: as here
+    if scripts and _at_opening is not None and (new := _run_when_opened() - _at_opening):
+        raise InputError(
+            f"{min(new)}: this text came after the file was opened, and its Register is on, so that it would run in "
+            "the copy that is rendered; switch Register off, or, if you trust it, save and open the file again."
+        )
     blend = folder / "scene.blend"
     opened = Path(bpy.data.filepath)
     caches = opened.parent / f"blendcache_{opened.stem}"  # where Blender looks for physics that is kept on the disk
@@ -42,7 +52,7 @@ def start(module: str, request: dict, folder: Path) -> process.Child:
     request = request | {
         "blend": str(blend),
         "name": opened.name,
-        "scripts": not bpy.app.autoexec_fail,  # whether those in the file may run: as here
+        "scripts": scripts,
         "scene": bpy.context.scene.name,
         "layer": bpy.context.view_layer.name,
     }
@@ -93,3 +103,24 @@ def _leave_when_closed(pipe: int) -> None:
     while os.read(pipe, 1 << 16):
         pass
     os._exit(3)
+
+
+def _run_when_opened() -> set[str]:
+    return {text.name for text in bpy.data.texts if text.use_module}
+
+
+@persistent
+def _opened(*_) -> None:
+    global _at_opening
+    _at_opening = _run_when_opened()
+
+
+def register() -> None:
+    bpy.app.timers.register(_opened)  # no file can be looked into while add-ons are registered
+    bpy.app.handlers.load_post.append(_opened)
+
+
+def unregister() -> None:
+    bpy.app.handlers.load_post.remove(_opened)
+    if bpy.app.timers.is_registered(_opened):
+        bpy.app.timers.unregister(_opened)

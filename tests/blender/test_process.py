@@ -78,6 +78,16 @@ tell(said=end(child(code))[-1]["message"])""")
     assert told["said"] == "The process ended with code 1: out of memory"
 
 
+def test_who_dies_without_listening_takes_nobody_along(run):
+    """More than a pipe holds is asked, of a child that is gone. Blender 4.3 leaves SIGPIPE as the system has it."""
+    told = run("""
+import signal
+if hasattr(signal, "SIGPIPE"):
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+tell(events=end(child("raise SystemExit(5)", {"a": "x" * 1_000_000})))""")
+    assert [e["event"] for e in told["events"]] == ["error"] and "code 5" in told["events"][0]["message"]
+
+
 def test_a_program_that_cannot_be_started(run):
     told = run("""
 try:

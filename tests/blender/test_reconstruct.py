@@ -106,14 +106,24 @@ camera.select_set(False)
 ball.hide_render = True
 refused("hidden")
 ball.hide_render = False
-os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
+part("addon.beside")._opened()  # as after a file was opened
+text = bpy.data.texts.new("guest")
+text.use_module = True
+refused("guest")
+text.use_module = False
+python, os.environ["TIMESPLAT_PYTHON"] = os.environ["TIMESPLAT_PYTHON"], "/nowhere/python"
 refused("python")
 os.environ["TIMESPLAT_PYTHON"] = "/bin/false"
 refused("dies")
 os.environ["TIMESPLAT_PYTHON"] = "/bin/sh"
 open(sys.argv[1], "w").write("not weights")
-tell(errors=errors, left=os.listdir(runs), states=[j.state for j in jobs.JOBS], frame=scene.frame_current,
-     scenes=len(bpy.data.scenes), clouds=sum("timesplat" in o for o in bpy.data.objects))
+told = dict(errors=errors, left=os.listdir(runs), states=[j.state for j in jobs.JOBS], frame=scene.frame_current,
+            scenes=len(bpy.data.scenes), clouds=sum("timesplat" in o for o in bpy.data.objects))
+os.environ["TIMESPLAT_PYTHON"] = python
+text.use_module = True
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1] + ".blend")
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1] + ".blend", use_scripts=True)
+tell(**told, host=list(bpy.ops.timesplat.reconstruct(size=32, every=8, **QUICK)))
 """
 SAID = {
     "ortho": "perspective",
@@ -123,6 +133,7 @@ SAID = {
     "folder": "no such folder",
     "suffix": "must end in .ply",
     "checkpoint": "no such checkpoint",
+    "guest": "guest: this text came after",
     "hidden": "no mesh is visible",
     "python": "no such file",
     "dies": "code 1",
@@ -135,6 +146,7 @@ def test_what_cannot_be_done_is_said(installed, tmp_path):
         said = told["errors"][key]
         assert word in said and "Traceback" not in said and "\n" not in said, (key, said)
     assert told["left"] == [] and told["scenes"] == 1 and told["clouds"] == 0 and told["frame"] == 9
+    assert told["host"] == ["FINISHED"]  # it was there when the file was opened
 
 
 SELECT = """
