@@ -32,6 +32,7 @@ from .sequence import (
     Passes,
     Sequence,
     View,
+    distinct,
     focal_from_fov,
     write_passes,
     write_sequence,
@@ -114,7 +115,9 @@ def capture(
             if lighting:
                 even_light(stage, made)
             cameras = _Cameras(stage, made, normalisation)
-            done, slugs = 0, _slugs(shots)
+            eyes = list(dict.fromkeys((s.rig, s.camera) for s in shots))
+            plain = ["_".join(re.sub(r"[^A-Za-z0-9-]+", "-", text) or "0" for text in who) for who in eyes]
+            done, slugs = 0, dict(zip(eyes, distinct(plain), strict=True))
             for frame, group in groupby(order, key=lambda i: shots[i].frame):
                 stage.frame_set(frames[frame])
                 if engine == "CYCLES":
@@ -193,20 +196,6 @@ def _view(shot: Shot, width: int, height: int) -> View:
     focal = focal_from_fov(shot.fov, side)
     cx, cy = width / 2 - shot.shift[0] * side, height / 2 + shot.shift[1] * side
     return View(shot.frame, shot.camera, shot.rig, shot.c2w, focal, focal, cx, cy)
-
-
-def _slugs(shots: list[Shot]) -> dict[tuple[str, str], str]:
-    """(rig, camera) -> a file name of its own for each, of plain letters, also where capitals count for nothing."""
-    slugs: dict[tuple[str, str], str] = {}
-    taken = set()
-    for who in dict.fromkeys((s.rig, s.camera) for s in shots):
-        slug = base = "_".join(re.sub(r"[^A-Za-z0-9-]+", "-", text) or "0" for text in who)
-        n = 2
-        while slug.lower() in taken:
-            slug, n = f"{base}-{n}", n + 1
-        taken.add(slug.lower())
-        slugs[who] = slug
-    return slugs
 
 
 # ---------------------------------------------------------------- the borrowed scene

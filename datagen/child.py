@@ -18,7 +18,7 @@ from pathlib import Path
 
 from .render import ALL, FIRST, MOST, Settings, is_made, stem, zoo_seed
 from .rigs import RIGS, targets
-from .sequence import InputError
+from .sequence import InputError, distinct
 
 
 def run_job(job: dict, say: Callable[[dict], None]) -> None:
@@ -124,16 +124,9 @@ def choose(opened, settings: Settings) -> list:
 
 
 def _slugs(clips: list) -> dict:
-    """Clip -> a file name of its own for each, also where capitals count for nothing."""
-    named, taken = {}, set()
-    for clip in clips:
-        slug = base = re.sub(r"[^A-Za-z0-9]+", "-", clip.name).strip("-") or "clip"
-        n = 2
-        while slug.lower() in taken:
-            slug, n = f"{base}-{n}", n + 1
-        taken.add(slug.lower())
-        named[slug] = clip
-    return named
+    """File name -> clip."""
+    plain = [re.sub(r"[^A-Za-z0-9]+", "-", clip.name).strip("-") or "clip" for clip in clips]
+    return dict(zip(distinct(plain), clips, strict=True))
 
 
 def main(job_file: str, log: str) -> int:

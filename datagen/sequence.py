@@ -302,6 +302,19 @@ def _to_json(seq: Sequence) -> dict:
     }
 
 
+def distinct(names: list[str]) -> list[str]:
+    """The names for files; -2, -3 and so on follow one that was there before, also where capitals count for nothing."""
+    found: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        new, n = name, 2
+        while new.lower() in taken:
+            new, n = f"{name}-{n}", n + 1
+        taken.add(new.lower())
+        found.append(new)
+    return found
+
+
 def sequences_in(root: Path) -> list[Path]:
     """The folders of finished Sequences at any depth of `root`, itself included, sorted. Hidden folders are left out:
     a Sequence is rendered in one and renamed when it is whole, perhaps at this moment."""
