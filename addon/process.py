@@ -94,10 +94,8 @@ class Child:
             reason = e.strerror or e
             raise InputError(f"{command[0]}: it cannot be started ({reason}); choose another program.") from None
         _running.add(self)
-        if not WINDOWS and signal.getsignal(signal.SIGPIPE) == signal.SIG_DFL:
-            signal.signal(
-                signal.SIGPIPE, signal.SIG_IGN
-            )  # as Python has it, but not Blender 4: it would end with the child
+        if not WINDOWS and signal.getsignal(signal.SIGPIPE) == signal.SIG_DFL:  # in Blender 4, which would end with it
+            signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it
         with contextlib.suppress(OSError):  # it may be gone already; then the log says why
             self.process.stdin.write((json.dumps({**request, "watch": True}) + "\n").encode())
             self.process.stdin.flush()  # and it stays open: its end is the sign that Blender is gone

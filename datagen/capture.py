@@ -95,7 +95,7 @@ def capture(
     seq = Sequence(
         width=width,
         height=height,
-        fps=scene.render.fps / scene.render.fps_base / apart(frames),
+        fps=scene.render.fps / scene.render.fps_base / _step(frames),
         frame_start=0,
         frame_end=len(frames) - 1,
         normalisation=normalisation,
@@ -180,7 +180,7 @@ def straight_srgb(linear: np.ndarray) -> np.ndarray:
     return rgba
 
 
-def apart(frames: list[int]) -> int:
+def _step(frames: list[int]) -> int:
     """Scene frames between two frames of a clip: 1 where there is but one, or they do not go on."""
     return max(frames[1] - frames[0], 1) if len(frames) > 1 else 1
 
