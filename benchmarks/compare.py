@@ -101,6 +101,8 @@ def run(args: argparse.Namespace, command: str) -> int:
     runs = chosen(args.only)
     environment = dict(os.environ, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1", MKL_NUM_THREADS="1")
     if args.core is not None:
+        if not hasattr(os, "sched_setaffinity"):
+            raise InputError(f"--core {args.core}: this system cannot pin a process to a core; leave it out.")
         if args.core not in os.sched_getaffinity(0):
             raise InputError(f"--core {args.core}: there is no such core for this process.")
         os.sched_setaffinity(0, {args.core})  # the scoring below; children inherit it

@@ -18,12 +18,9 @@ Markdown and CSV, each with its command. Scores are kept in OUT/scores.json: an 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-
-os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
 
 import numpy as np
 from tqdm import tqdm

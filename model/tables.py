@@ -143,7 +143,13 @@ def machine() -> dict:
     if cpuinfo.exists():
         names = [x.split(":", 1)[1].strip() for x in cpuinfo.read_text().splitlines() if x.startswith("model name")]
         name = names[0] if names else name
-    return {"cpu": name, "cores": len(os.sched_getaffinity(0)), "system": f"{platform.system()} {platform.machine()}"}
+    return {"cpu": name, "cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
+
+
+def usable_cores() -> int:
+    """How many processor cores this process may use; of the whole machine where the system does not say (macOS and
+    Windows)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def versions() -> dict:

@@ -1,7 +1,9 @@
 """The paper's studies on a scene known by hand, and the driver of the training comparisons."""
 
+import importlib
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -251,3 +253,8 @@ def test_chosen_frames_cycle_through_the_canonical_cameras(evaluation_folder):
     views = [seq.views[i] for i in subjects.every(subjects.Subject("x", seq, 1), 4)]
     assert [v.frame for v in views] == FRAMES[::4]
     assert [v.camera for v in views] == ["front", "left", "back", "right", "front", "left"]
+
+
+def test_studies_load_where_affinity_does_not_exist(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS and Windows
+    importlib.reload(studies)

@@ -1,6 +1,7 @@
 """Figures of many views, and the tables that are made of them."""
 
 import csv
+import os
 import re
 from pathlib import Path
 
@@ -87,3 +88,8 @@ def test_one_setup_is_flat_and_files_are_whole(tmp_path: Path):
     tables.write_metrics(tmp_path, flat)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["metrics.json", "metrics.md"]
     assert (tmp_path / "metrics.md").read_text().startswith("`timesplat evaluate x`\n\n| method | PSNR |")
+
+
+def test_the_machine_is_named_where_affinity_does_not_exist(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS and Windows
+    assert tables.machine()["cores"] == os.cpu_count()
