@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import shlex
 import sys
 from pathlib import Path
 
@@ -40,6 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     args = parser.parse_args(argv)
+    args.typed = shlex.join(["timesplat", *map(str, argv)])  # for tables, which say by which command they were made
     try:
         return args.run(args) or 0
     except InputError as e:
@@ -311,9 +313,7 @@ def evaluate(args: argparse.Namespace) -> int:
         methods,
         args.out,
         args.checkpoint,
-        command=f"timesplat evaluate {' '.join(args.assets)} --setup {args.setup} --size {args.size} "
-        f"--stride {args.stride} --methods {args.methods} --seconds {args.seconds:g} --out {args.out}"
-        + (f" --checkpoint {args.checkpoint}" if args.checkpoint else ""),
+        command=args.typed,
         setups=tuple(setups),
         sizes=tuple(sorted(sizes)),
         stride=tuple(n for _, n in sorted(zip(sizes, stride * len(sizes), strict=False))),

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import time
 from collections.abc import Callable
 from datetime import date
@@ -16,16 +15,6 @@ from tqdm import tqdm
 from timesplat.benchmarks import charts, renderer
 from timesplat.datagen.render import Settings, cores
 from timesplat.datagen.sequence import InputError
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """What makes these figures again, without what says how fast."""
-    words = ["timesplat", "bench", *args.assets, "--out", str(args.out), "--jobs", str(args.jobs)]
-    words += [
-        w for k in ("objects", "methods", "limit") if getattr(args, k) is not None for w in (f"--{k}", getattr(args, k))
-    ]
-    words += ["--quick"] * args.quick + ["--size", args.size] * (args.size != 128)
-    return shlex.join(map(str, words))
 
 
 def check(args: argparse.Namespace) -> None:
@@ -63,8 +52,9 @@ def run(args: argparse.Namespace, render_into: Callable) -> int:
 def measure(args: argparse.Namespace, render_into: Callable, started: float) -> list[str]:
     """bench.csv; -> what could not be rendered."""
     from timesplat.model import bench
-    from timesplat.model.evaluate import find_sequences
+    from timesplat.model.evaluate import find_sequences, weights_of
     from timesplat.model.pareto import write_csv
+    from timesplat.model.provenance import Provenance
     from timesplat.model.tables import machine, versions
 
     methods = [m for m in args.methods.split(",") if m.strip()] if args.methods else None
@@ -84,6 +74,7 @@ def measure(args: argparse.Namespace, render_into: Callable, started: float) -> 
     rows = bench.run(sequences, points, args.out, args.jobs, deadline, started)
     if not rows:
         raise InputError(f"{args.out}: nothing was measured in the time given; allow more.")
+    weights = [weights_of(way.spec, way.checkpoint) for way in (bench.parse(p.label) for p in points)]
     facts = {
         "date": date.today().isoformat(),
         "machine": machine(),
@@ -92,8 +83,9 @@ def measure(args: argparse.Namespace, render_into: Callable, started: float) -> 
         "seconds_total": round(bench.spent(args.out / "rows.jsonl"), 1),
         "centre": [points[0].setup, points[0].size],
         "notes": notes,
+        "made_by": str(Provenance.of(args.typed, weights)),
     }
-    write_csv(args.out / "bench.csv", rows, command_line(args), facts)
+    write_csv(args.out / "bench.csv", rows, args.typed, facts)
     return failures
 
 

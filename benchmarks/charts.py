@@ -314,7 +314,14 @@ def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, 
     ]
     if short:
         what.append(f"Left out, for not all objects were reached in the time given: {', '.join(short)}.")
-    parts = ["# Speed against accuracy", f"`{command}`", *what, "## Pareto frontiers", frontiers(centre)]
+    parts = [
+        "# Speed against accuracy",
+        f"`{command}`",
+        facts.get("made_by", ""),
+        *what,
+        "## Pareto frontiers",
+        frontiers(centre),
+    ]
     parts += [f"![{p}]({p}.png)" for p in pictures]
     others = [m for m in means if m not in centre]
     parts += ["## At the centre", table(centre)] + (["## Other inputs and sizes", table(others)] if others else [])
@@ -326,7 +333,7 @@ def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, 
         "at this size. Coverage: what share of the object the input views show, by the way's own Gaussians "
         "(`model.coverage`). +dense: tokens of the network everywhere, not only where the object is."
     )
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def frontiers(centre: list[Mean]) -> str:

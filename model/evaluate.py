@@ -31,6 +31,7 @@ from .flip import features, flip
 from .gaussians import Gaussians4D, Moving
 from .lpips import LPIPS
 from .metrics import psnr, psnr_foreground, ssim
+from .provenance import Provenance
 from .rasterize import render
 from .reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
 from .tables import collect as collect  # for whoever scores single runs
@@ -226,11 +227,16 @@ class Plan:
 
 def key_of(seq: Sequence, setup: str, size: int | None, stride: int, method: str, plan: Plan, lpips: bool) -> str:
     """Names a row by all that has a say in it but the code: start with another folder after changing that."""
-    name = parse_method(method).name
-    weights = Path(plan.checkpoint or CHECKPOINTS / f"{WEIGHTS.get(name, name)}.safetensors")
+    weights = weights_of(method, plan.checkpoint)
     parts = [(seq.root / "transforms.json").read_bytes(), weights.read_bytes() if weights.is_file() else b""]
     parts.append(f"{setup} {size or seq.width} {stride} {method} {lpips} {plan.seconds}".encode())
     return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()[:20]
+
+
+def weights_of(method: str, checkpoint: Path | None = None) -> Path:
+    """The checkpoint that a method loads, if it loads one."""
+    name = parse_method(method).name
+    return Path(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(name, name)}.safetensors")
 
 
 def evaluate_object(
@@ -282,7 +288,7 @@ def evaluate_folders(
 ) -> dict:
     """Scores every method on every Sequence {name: Sequence}; see `Plan` for keywords. Below `out`: rows.jsonl,
     from which an interrupted run goes on, metrics.json, metrics.md and tables.md, tables.csv (headed by
-    `command`). Prints the table, returns the metrics."""
+    `command`, the code's revision and the hashes of the checkpoints). Prints the table, returns the metrics."""
     plan = Plan(tuple(methods), checkpoint=checkpoint, **plan)
     out.mkdir(parents=True, exist_ok=True)
     units = [(name, seq, setup) for setup in plan.setups for name, seq in sequences.items()]
@@ -295,7 +301,8 @@ def evaluate_folders(
             bar.update()
     if not rows:
         raise InputError(f"{out}: nothing was scored in the time given; allow more.")
-    metrics = gather(rows, command)
+    weights = [weights_of(m, plan.checkpoint) for m in plan.methods]
+    metrics = gather(rows, Provenance.of(command, weights))
     write_metrics(out, metrics)
     print(table(metrics))
     return metrics

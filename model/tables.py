@@ -8,6 +8,7 @@ import io
 import json
 import os
 import platform
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from .lpips import HINT
 from .protocol import TABLE
+from .provenance import Provenance
 from .reconstruct import NEEDS_PASSES
 
 # Over all views scored (the paper's five a frame); `novel_…` and flip over those alone that no input shows.
@@ -111,15 +113,16 @@ def collect(objects: dict[str, dict[str, dict]]) -> dict:
     return {"methods": methods, "objects": per_object, "machine": machine(), "versions": versions()}
 
 
-def gather(rows: list[dict], command: str = "") -> dict:
+def gather(rows: list[dict], provenance: Provenance) -> dict:
     """Rows of `evaluate.evaluate_folders` -> `collect` where there is one setup and size, else the same under
-    `setups` by setup and size; with the command, the sizes' strides, and the runs at a time while timing."""
+    `setups` by setup and size; with how it was made, the sizes' strides, and the runs at a time while timing."""
     parts: dict[tuple[str, int], dict[str, dict[str, dict]]] = {}
     for r in rows:
         parts.setdefault((r["setup"], r["size"]), {}).setdefault(r["object"], {})[r["method"]] = r
     found = {key: collect(objects) for key, objects in parts.items()}
     how = {
-        "command": command,
+        "command": provenance.command,
+        "provenance": asdict(provenance),
         "stride": {str(r["size"]): r["stride"] for r in rows},
         "jobs": max(r["jobs"] for r in rows),
         "views": {f"{s or 'all'} {n}": len(_first(objects)["frames"]["novel"]) for (s, n), objects in parts.items()},
@@ -251,9 +254,21 @@ def theirs(text: str) -> str:
     return markdown(head, lines)
 
 
+def provenance_lines(metrics: dict) -> tuple[str, str]:
+    """The command that made the metrics; and the code and the checkpoints."""
+    provenance = Provenance(**metrics["provenance"])
+    return provenance.command, str(provenance)
+
+
+def made_by(metrics: dict) -> str:
+    """The same as Markdown."""
+    command, rest = provenance_lines(metrics)
+    return f"`{command}`\n\n{rest}"
+
+
 def tables_md(metrics: dict) -> str:
     """tables.md: every table is headed by the command that made it, the paper's by where they are from."""
-    made = f"`{metrics['command']}`"
+    made = made_by(metrics)
     count = max(len(p["objects"]) for sizes in metrics["setups"].values() for p in sizes.values())
     stride = ", ".join(
         f"{s}²: {'every frame' if n == 1 else f'one frame of {n}'}" for s, n in metrics["stride"].items()
@@ -278,7 +293,7 @@ def tables_csv(metrics: dict) -> str:
     figures = [k for k in COLUMNS if k != "seconds_scoring"]
     setups = list(dict.fromkeys([*metrics["setups"], *TABLE]))
     out = io.StringIO()
-    out.write(f"# {metrics['command']}\n")
+    out.write("".join(f"# {line}\n" for line in provenance_lines(metrics)))
     writer = csv.writer(out, lineterminator="\n")
     head = ["made_by", "objects", "resolution", "model", "sees", "initialised"]
     writer.writerow(head + [f"{s or 'all'}_{k}" for s in setups for k in figures])
@@ -299,7 +314,7 @@ def write_metrics(folder: Path, metrics: dict) -> None:
     """`metrics.json` and the same as `metrics.md`; of several setups also `tables.md` and `tables.csv`. Each
     whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    made = f"`{metrics['command']}`\n\n" if metrics.get("command") else ""
+    made = f"{made_by(metrics)}\n\n" if "provenance" in metrics else ""
     texts = {"metrics.json": json.dumps(metrics, indent=1), "metrics.md": f"{made}{table(metrics)}\n"}
     if "setups" in metrics:
         texts |= {"tables.md": tables_md(metrics), "tables.csv": tables_csv(metrics)}

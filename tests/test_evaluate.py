@@ -1,8 +1,11 @@
 """The instrument: what metrics.json holds, and that its figures are those of the pictures."""
 
+import hashlib
 import json
 import re
+import shlex
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +15,7 @@ from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.model import evaluate
 from timesplat.model.evaluate import draw, evaluate_folders, evaluate_method, load_inputs, load_truth, parse_method
 from timesplat.model.metrics import psnr
+from timesplat.model.provenance import ROOT, revision
 from timesplat.model.tables import COLUMNS
 from timesplat.model.views import load_views
 
@@ -184,5 +188,22 @@ def test_the_command_scores_finished_sequences(folders, tmp_path, capsys):
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert list(metrics["objects"]) == ["a", "b"] and metrics["methods"]["white"]["psnr"] > 0
-    assert metrics["command"].startswith(f"timesplat evaluate {folders} --setup alternating")
+    assert metrics["command"] == shlex.join(["timesplat", *words, "--out", str(tmp_path / "out")])
     assert "LPIPS is left out" in capsys.readouterr().err
+
+
+def test_tables_say_by_which_command_code_and_weights_they_were_made(folders, tmp_path):
+    for f in folders.glob("?/line/transforms.json"):
+        f.write_text(re.sub(r'"rig": "(?!target)\w*"', '"rig": "alternating"', f.read_text()))
+    out = tmp_path / "my tables"
+    words = ["evaluate", str(folders), "--setup", "alternating", "--size", "16", "--methods", "white,guided"]
+    words += ["--protocol", "paper", "--samples", "7", "--seed", "3", "--no-lpips", "--stride", "8", "--jobs", "1"]
+    assert main([*words, "--out", str(out)]) == 0
+    weights = Path(evaluate.CHECKPOINTS / "guided.safetensors").read_bytes()
+    for name in ("metrics.md", "metrics.json"):
+        text = (out / name).read_text()
+        for wanted in ("--protocol paper", "--samples 7", "--seed 3", "--no-lpips", f"'{out}'"):
+            assert wanted in text
+        assert hashlib.sha256(weights).hexdigest()[:12] in text
+    told = json.loads((out / "metrics.json").read_text())["provenance"]
+    assert (told["revision"], told["clean"]) == revision(ROOT) and set(told["checkpoints"]) == {"guided.safetensors"}

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from timesplat.model import tables
+from timesplat.model.provenance import Provenance
 from timesplat.model.tables import COLUMNS, collect, gather, paper_rows, summarise, table
+
+MADE = Provenance(
+    "timesplat evaluate data --setup all", "1.0", "1234567890ab", False, {"guided.safetensors": "0123456789ab"}
+)
 
 
 def row(values, setup="alternating", size=128, name="a", method="lift"):
@@ -42,13 +47,14 @@ def test_nothing_novel_is_no_figure():
 def metrics():
     rows = [row([20.0, 22.0], s, n, o) for s in ("alternating", "interpolation") for n in (128, 256) for o in "ab"]
     rows += [row([15.0, 16.0], "alternating", 256, "a", "gs-lrm-frame")]
-    return gather(rows, "timesplat evaluate data --setup all")
+    return gather(rows, MADE)
 
 
 def test_the_layout_of_the_paper(metrics):
     text = tables.tables_md(metrics)
     lines = text.splitlines()
     assert lines[0] == "`timesplat evaluate data --setup all`"
+    assert lines[2] == "timesplat 1.0; revision 1234567890ab with uncommitted changes; guided.safetensors 0123456789ab"
     assert "| Res. | Model | Sees | Alter. Canonical Views: PSNR | LPIPS | SSIM | Frame Interpolation: PSNR" in text
     assert "| 128 | lift | depth + motion | 21.00 | – | 21.000 | 21.00 | – | 21.000 |" in lines
     assert "| 256 | gs-lrm-frame (1 of 2 objects) | RGB only | 15.50 | – | 15.500 | – | – | – |" in lines
@@ -60,8 +66,8 @@ def test_the_layout_of_the_paper(metrics):
 
 
 def test_csv_holds_ours_and_the_papers(metrics):
-    first, *rest = tables.tables_csv(metrics).splitlines()
-    assert first == "# timesplat evaluate data --setup all"
+    first, second, *rest = tables.tables_csv(metrics).splitlines()
+    assert first == "# timesplat evaluate data --setup all" and second == f"# {MADE}"
     rows = list(csv.DictReader(rest))
     assert [r["model"] for r in rows if r["made_by"] == "ours"] == ["lift", "lift", "gs-lrm-frame"]
     assert float(rows[0]["alternating_psnr"]) == 21 and rows[0]["random_psnr"] == "" == rows[0]["alternating_lpips"]
@@ -83,11 +89,13 @@ def test_the_papers_rows():
 
 
 def test_one_setup_is_flat_and_files_are_whole(tmp_path: Path):
-    flat = gather([row([20.0, 21.0])], "timesplat evaluate x")
+    flat = gather([row([20.0, 21.0])], Provenance("timesplat evaluate x", "1.0"))
     assert set(flat) >= {"methods", "objects", "machine", "versions", "command", "stride", "jobs"}
     tables.write_metrics(tmp_path, flat)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["metrics.json", "metrics.md"]
-    assert (tmp_path / "metrics.md").read_text().startswith("`timesplat evaluate x`\n\n| method | PSNR |")
+    assert (
+        (tmp_path / "metrics.md").read_text().startswith("`timesplat evaluate x`\n\ntimesplat 1.0\n\n| method | PSNR |")
+    )
 
 
 def test_the_machine_is_named_where_affinity_does_not_exist(monkeypatch):
