@@ -84,7 +84,7 @@ def fewest(
         raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
-        g, views = g[g.alive()], own(views, device)
+        g, views = g[g.alive()].with_axes(), own(views, device)
         held = judging(views, min(HELD, max(len(views) // 4, 1))).tolist()
         seen, unseen = views[[i for i in range(len(views)) if i not in held] or held], views[held]
         beside = around(g, views) if near else None

@@ -8,6 +8,8 @@ move through the clip is fused over all of it, into Gaussians with long lives.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -26,7 +28,7 @@ def contribution(g: Gaussians4D, views: Views) -> Tensor:
     height, width = views.size
     with gradients():
         rgb = torch.zeros_like(g.rgb).requires_grad_()
-        here = Gaussians4D(g.xyz, g.t, g.velocity, g.sigma_t, g.scale, g.rotation, rgb, g.opacity).map(torch.clone)
+        here = replace(g, rgb=rgb).map(torch.clone)
         picture, _ = render(here, views.c2w, views.intrinsics, views.time, width, height, background=0.0)
         (grad,) = torch.autograd.grad(picture[..., 0].sum(), rgb)
     return grad[:, 0]
@@ -39,6 +41,7 @@ def fuse(g: Gaussians4D, count: int) -> Gaussians4D:
     whole clip. The share of each is what it covers, for as long as it lives, times its opacity."""
     if len(g) <= count:
         return g
+    g = g.with_axes()
     seen = _seen(g.opacity, g.scale, g.sigma_t)
     weight = seen + 1e-9 * seen.mean() + 1e-30
     part = ((g.t.clamp(-1, 1) + 1) / 2 * MOMENTS).floor().clamp_max(MOMENTS - 1)

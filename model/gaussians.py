@@ -8,7 +8,8 @@ while: Σ_44 = σ_t², Σ_{1:3,4} = v σ_t², Σ_xyz = Σ_3 + v vᵀ σ_t². At 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import numpy as np
@@ -36,11 +37,11 @@ class Gaussians4D:
     t: Tensor  # (…,N) its own time μ_t, clip = [-1,1]
     velocity: Tensor  # (…,N,3) normalised units per unit of t
     sigma_t: Tensor  # (…,N) lifetime σ_t > 0
-    scale: Tensor  # (…,N,3) standard deviations of Σ_3 along its axes, > 0
-    rotation: Tensor  # (…,N,4) unit quaternion w x y z of Σ_3's axes
+    scale: Tensor  # (…,N,3) standard deviations of Σ_3 along its axes, > 0; where there is cov3: see `with_axes`
+    rotation: Tensor  # (…,N,4) unit quaternion w x y z of Σ_3's axes; the same
     rgb: Tensor  # (…,N,3) sRGB-encoded colour, 0..1 (not enforced)
     opacity: Tensor  # (…,N) 0..1
-    cov3: Tensor | None = None  # (…,N,3,3) Σ_3 where gradients must reach it (the paper's head), else None
+    cov3: Tensor | None = None  # (…,N,3,3) Σ_3 where it is what is known (the paper's head), else None
 
     def __len__(self) -> int:
         return self.xyz.shape[-2]
@@ -101,7 +102,8 @@ class Gaussians4D:
 
     def to_asset(self, clip: Clip) -> Asset:
         """numpy twin for files and Blender; no batch dimensions."""
-        arrays = {k: getattr(self, k).detach().cpu().float().numpy() for k in FIELDS}
+        axed = self.with_axes()
+        arrays = {k: getattr(axed, k).detach().cpu().float().numpy() for k in FIELDS}
         return Asset(**{k: np.ascontiguousarray(a) for k, a in arrays.items()}, clip=clip)
 
     @staticmethod
@@ -110,10 +112,21 @@ class Gaussians4D:
 
     @staticmethod
     def from_covariance(xyz, t, velocity, sigma_t, cov3, rgb, opacity) -> Gaussians4D:
-        """From Σ_3 (…,N,3,3) instead of scale and rotation, which are derived without gradient."""
+        """From Σ_3 (…,N,3,3), which alone is the shape: until `with_axes` is asked for, scale and rotation are those
+        of the box around it, without gradient."""
+        sides = cov3.detach().diagonal(dim1=-2, dim2=-1).sqrt()
+        axes = torch.zeros_like(cov3[..., 0]).detach()
+        upright = torch.cat([torch.ones_like(axes[..., :1]), axes], -1)
+        return Gaussians4D(xyz, t, velocity, sigma_t, sides, upright, rgb, opacity, cov3)
+
+    def with_axes(self) -> Gaussians4D:
+        """The same with scale and rotation for certain and no cov3, as files, fusion and fits need it; without gradient
+        where they are derived."""
+        if self.cov3 is None:
+            return self
         with torch.no_grad():
-            scale, rotation = scale_rotation_from_covariance(cov3)
-        return Gaussians4D(xyz, t, velocity, sigma_t, scale, rotation, rgb, opacity, cov3)
+            scale, rotation = scale_rotation_from_covariance(self.cov3)
+        return replace(self, scale=scale, rotation=rotation, cov3=None)
 
     @staticmethod
     def cat(parts: list[Gaussians4D]) -> Gaussians4D:
@@ -179,11 +192,57 @@ def kinematic_from_covariance(cov: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scale_rotation_from_covariance(cov3: Tensor) -> tuple[Tensor, Tensor]:
-    """cov3 (…,3,3) symmetric positive -> scale (…,3) ascending, rotation (…,4). By eigen-decomposition, whose
-    gradient is infinite for equal eigenvalues: training goes through `Gaussians4D.covariance3` instead."""
-    val, vec = torch.linalg.eigh(cov3)
-    vec = vec * torch.sign(torch.linalg.det(vec))[..., None, None]
-    return val.clamp_min(1e-14).sqrt(), quaternion(vec)
+    """cov3 (…,3,3) symmetric positive -> scale (…,3) ascending, rotation (…,4). By `eigh3`, in float64, and not for
+    gradients, which are infinite for equal eigenvalues: training goes through `Gaussians4D.covariance3` instead."""
+    val, vec = eigh3(cov3.double())
+    return val.clamp_min(1e-14).sqrt().to(cov3.dtype), quaternion(vec).to(cov3.dtype)
+
+
+def eigh3(A: Tensor) -> tuple[Tensor, Tensor]:
+    """A (…,3,3) symmetric -> eigenvalues (…,3) ascending, eigenvectors (…,3,3) in columns, of determinant +1. In closed
+    form, so that it is the same few operations for any number of matrices on any device, where torch.linalg.eigh takes
+    a quarter of a forward pass and is reported to fail on CUDA for large batches.
+
+    The eigenvalue farthest from the other two is the stable root of the cubic (Smith 1961); its vector is the longest
+    cross product of two rows of A - λ, and what is left is a 2x2 problem in the plane across it, solved by its angle:
+    equal eigenvalues do no harm (after Eberly, "A Robust Eigensolver for 3x3 Symmetric Matrices", 2014)."""
+    size = A.abs().amax((-2, -1)).clamp_min(torch.finfo(A.dtype).tiny)
+    A = A / size[..., None, None]
+    eye = torch.eye(3, dtype=A.dtype, device=A.device)
+    mean = A.diagonal(dim1=-2, dim2=-1).mean(-1)
+    B = A - mean[..., None, None] * eye
+    p = (B.square().sum((-2, -1)) / 6).sqrt()
+    half_det = (0.5 * _det3(B / p.clamp_min(1e-150)[..., None, None])).clamp(-1, 1)
+    angle = torch.acos(half_det) / 3
+    largest = half_det >= 0  # whether the one apart is the largest, else it is the smallest
+    root = torch.where(largest, 2 * torch.cos(angle), 2 * torch.cos(angle + 2 * math.pi / 3))
+    rows = B - (p * root)[..., None, None] * eye
+    crosses = torch.linalg.cross(rows[..., [0, 0, 1], :], rows[..., [1, 2, 2], :])
+    best = crosses.square().sum(-1).argmax(-1)
+    apart = crosses.gather(-2, best[..., None, None].expand(*best.shape, 1, 3)).squeeze(-2)
+    length = apart.norm(dim=-1, keepdim=True)
+    apart = torch.where(length > 1e-100, apart / length.clamp_min(1e-150), eye[2])  # a ball has no axes
+    # Two unit vectors across it, the first from the coordinate axis that it is farthest from.
+    u = torch.linalg.cross(apart, eye[apart.abs().argmin(-1)])
+    u = u / u.norm(dim=-1, keepdim=True)
+    v = torch.linalg.cross(apart, u)
+    Au, Av = (B @ u[..., None])[..., 0], (B @ v[..., None])[..., 0]
+    a, b, c = (u * Au).sum(-1), (u * Av).sum(-1), (v * Av).sum(-1)
+    turn = 0.5 * torch.atan2(2 * b, a - c)[..., None]
+    major = torch.cos(turn) * u + torch.sin(turn) * v
+    minor = torch.linalg.cross(apart, major)
+    values = torch.stack([(x * (B @ x[..., None])[..., 0]).sum(-1) for x in (minor, major, apart)], -1)
+    # minor <= major; the one apart comes last if it is the largest, else first.
+    last, first = (torch.tensor(x, device=A.device) for x in ([0, 1, 2], [2, 0, 1]))
+    order = torch.where(largest[..., None], last, first)
+    vectors = torch.stack([minor, major, apart], -1)
+    vectors = vectors.gather(-1, order[..., None, :].expand(vectors.shape))
+    values = (values.gather(-1, order) + mean[..., None]) * size[..., None]
+    return values, vectors * _det3(vectors).sign()[..., None, None]
+
+
+def _det3(A: Tensor) -> Tensor:
+    return (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(-1)
 
 
 def paper_from_kinematic(g: Gaussians4D) -> tuple[Tensor, Tensor, Tensor]:

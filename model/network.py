@@ -221,8 +221,7 @@ class Network(nn.Module):
     def activate(self, g: Tensor) -> Gaussians4D:
         """g (…,outputs) in the order xyz t rgb scale_xyz scale_t, then q_l q_r opacity (paper) or q velocity
         opacity (kinematic) -> Gaussians with the appendix's activations and biases. With a HexPlane xyz rgb
-        scale_xyz q opacity -> Gaussians that do not move, and live for ever. In training the paper head's shape is
-        in `cov3` alone; `scale` and `rotation` are those of the box around it."""
+        scale_xyz q opacity -> Gaussians that do not move, and live for ever. The paper head's shape is in `cov3`."""
         still = self.config.motion == "hexplane"
         if still:
             none = torch.zeros_like(g[..., :1])
@@ -246,10 +245,6 @@ class Network(nn.Module):
         R = isoclinic_rotation(F.normalize(g[..., 11:15], dim=-1), F.normalize(g[..., 15:19], dim=-1))
         M = R * torch.cat([scale, scale_t[..., None]], -1)[..., None, :]
         velocity, sigma_t, cov3 = kinematic_from_covariance(M @ M.mT)
-        if self.training:
-            # The eigenvectors are a quarter of the forward pass, and only files and figures need them.
-            sides, axes = cov3.detach().diagonal(dim1=-2, dim2=-1).sqrt(), _IDENTITY.to(g).expand_as(g[..., :4])
-            return Gaussians4D(xyz, t, velocity, sigma_t, sides, axes, rgb, opacity, cov3)
         return Gaussians4D.from_covariance(xyz, t, velocity, sigma_t, cov3, rgb, opacity)
 
     def residual(self, g: Tensor, base: Gaussians4D, direction: Tensor, slack: Tensor) -> Gaussians4D:

@@ -99,7 +99,7 @@ def refine(
     began = clock()
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
-        g = g[g.alive()]
+        g = g[g.alive()].with_axes()
         if not len(g):
             return start
         views = own(views, device)

@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 from timesplat.model.asset import Clip
 from timesplat.model.gaussians import (
     Gaussians4D,
+    eigh3,
     isoclinic_rotation,
     kinematic_from_covariance,
     paper_from_kinematic,
@@ -96,6 +97,43 @@ def test_scale_and_rotation_rebuild_the_covariance():
     scale, q = scale_rotation_from_covariance(cov)
     M = rotation_matrix(q) * scale[:, None, :]
     torch.testing.assert_close(M @ M.mT, cov, rtol=1e-8, atol=1e-12)
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**31), small=st.integers(-6, 0), middle=st.floats(0, 1))
+def test_closed_form_axes_are_lapacks(seed, small, middle):
+    """Of needles, discs, balls and all between; sides from 1 to 1e-6."""
+    generator = torch.Generator().manual_seed(seed)
+    R = rotation_matrix(normalize(torch.randn(16, 4, dtype=torch.float64, generator=generator), dim=-1))
+    sides = 10.0 ** torch.tensor([small, small * (1 - middle), 0.0], dtype=torch.float64)
+    sides = sides[torch.randperm(3, generator=generator)]
+    A = R @ torch.diag(sides) @ R.mT
+    A = 0.5 * (A + A.mT)
+    values, vectors = eigh3(A)
+    torch.testing.assert_close(values, torch.linalg.eigvalsh(A), rtol=1e-9, atol=1e-14)
+    torch.testing.assert_close(vectors @ torch.diag_embed(values) @ vectors.mT, A, rtol=0, atol=1e-14)
+    torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, dtype=A.dtype).expand_as(A), rtol=0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.det(vectors), torch.ones(16, dtype=A.dtype))
+
+
+@pytest.mark.parametrize("sides", [(1, 1, 1), (2, 2, 1), (1, 2, 2), (0, 0, 1), (0, 1, 1), (0, 0, 0), (3, 1, 2)])
+def test_axes_of_equal_and_no_sides(sides):
+    A = torch.diag(torch.tensor(sides, dtype=torch.float64))
+    values, vectors = eigh3(A)
+    assert values.tolist() == pytest.approx(sorted(sides), abs=1e-15)
+    torch.testing.assert_close(vectors @ torch.diag(values) @ vectors.mT, A, rtol=0, atol=1e-15)
+    assert float(torch.linalg.det(vectors)) == pytest.approx(1)
+
+
+def test_axes_are_derived_where_they_are_needed_and_not_before(monkeypatch):
+    g = cloud(20)
+    known = Gaussians4D.from_covariance(g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity)
+    monkeypatch.setattr(torch.linalg, "eigh", None)  # fails where it is called
+    back = known.with_axes()
+    assert back.cov3 is None and known.cov3 is not None
+    torch.testing.assert_close(back.covariance3(), g.covariance3())
+    of_file = Gaussians4D.from_asset(known.to_asset(Clip()))
+    torch.testing.assert_close(of_file.covariance3(), g.covariance3().float(), rtol=1e-4, atol=1e-9)
 
 
 def test_asset_round_trip_and_cat():
