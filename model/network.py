@@ -136,19 +136,28 @@ class Network(nn.Module):
         """views: V images, height and width multiples of the patch; geometry: for the sources `sweep` and
         `given`. Pixels in dropped patches, and pixels that own no Gaussian of the
         geometry, yield none."""
-        c, p = self.config, self.config.patch
+        p = self.config.patch
         height, width = views.size
         if height % p or width % p:
             raise ValueError(f"images are {width}x{height}: width and height must be multiples of {p}")
         keep = self.kept_patches(views, drop_empty)
         alpha = gather_pixels(views.alpha[..., None], keep, p)
         colour = gather_pixels(views.rgb, keep, p) * alpha + (1 - alpha)  # over white
-        origin, direction = patch_rays(views, keep, p)
+        with single_precision(views.rgb.device):  # rays: half a pixel would be lost in bfloat16
+            origin, direction = patch_rays(views, keep, p)
         time = gather_pixels(views.time[:, None, None, None].expand(*views.alpha.shape, 1), keep, p)
         maps = [2 * colour - 1, time, pluecker(origin, direction)]
         if geometry is not None:
             maps.append(gather_pixels(geometry.features, keep, p))
-        x = self.embed(torch.cat(maps, -1).flatten(1))  # (T, p²·channels) -> (T, D)
+        pixels, free, planes = self.transform(torch.cat(maps, -1).flatten(1))  # (T, p²·channels) -> (T, D) …
+        with single_precision(views.rgb.device):  # heads and conversion: a covariance would not stay positive
+            return self.decode_scene(views, geometry, keep, (origin, direction, time), pixels, free, planes)
+
+    def transform(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """x (T, p²·channels) patches -> what the transformer makes of the tokens of patches (T,D), of free Gaussians
+        (c.free,D) and of planes (…,D), float32. The one part whose matrix products autocast may turn to bfloat16."""
+        c = self.config
+        x = self.embed(x)
         counts = [len(x), c.free, hexplane.TOKENS if c.motion == "hexplane" else 0]
         if c.free:
             x = torch.cat([x, self.free_tokens])
@@ -157,8 +166,16 @@ class Network(nn.Module):
         x = self.norm_in(x)
         for block in self.blocks:
             x = checkpoint(block, x, use_reentrant=False) if self.checkpointing and self.training else block(x)
-        x, free, planes = self.norm_out(x).split(counts)
-        g = self.decode(x).float().unflatten(-1, (p * p, c.pixel_outputs))  # (T, p², outputs)
+        return self.norm_out(x).float().split(counts)
+
+    def decode_scene(
+        self, views: Views, geometry: Geometry | None, keep: Tensor, pixels: tuple[Tensor, Tensor, Tensor],
+        x: Tensor, free: Tensor, planes: Tensor,
+    ) -> Gaussians4D | Moving:  # fmt: skip
+        """The Gaussians of the transformer's tokens; pixels: ray origins, directions (T,p²,3) and times (T,p²,1)."""
+        c, p = self.config, self.config.patch
+        origin, direction, time = pixels
+        g = self.decode(x).unflatten(-1, (p * p, c.pixel_outputs))  # (T, p², outputs)
         if c.time == "aligned":
             at = torch.zeros_like(time) if geometry is not None else time
             g = torch.cat([g[..., :3], at, g[..., 3:]], -1)
@@ -170,9 +187,9 @@ class Network(nn.Module):
         else:
             out = self.pixel_aligned(g, origin, direction).map(lambda m: m.flatten(0, 1))
         if c.free:
-            out = Gaussians4D.cat([out, self.free_gaussians(self.decode_free(free).float())])
+            out = Gaussians4D.cat([out, self.free_gaussians(self.decode_free(free))])
         if c.motion == "hexplane":
-            planes = hexplane.planes_from_tokens(self.decode_planes(planes).float())
+            planes = hexplane.planes_from_tokens(self.decode_planes(planes))
             out = hexplane.Deformed(out, planes, [m.weight for m in self.deform[::2]])
         return out
 
@@ -294,6 +311,11 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
         ],
         -1,
     )
+
+
+def single_precision(device: torch.device):
+    """A context in which no operation is autocast to a shorter type."""
+    return torch.autocast(device.type, enabled=False)
 
 
 def patches(m: Tensor, p: int) -> Tensor:

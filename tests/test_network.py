@@ -4,8 +4,10 @@ import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError
+from timesplat.model.gaussians import FIELDS
 from timesplat.model.lift import lift_geometry
 from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patch_rays
+from timesplat.model.reconstruct import geometry_for
 from timesplat.model.sweep import sweep_geometry
 from timesplat.model.views import rays
 
@@ -229,3 +231,40 @@ def test_rows_lead_from_pixels_to_outputs(views):
     order = gather_pixels(number, keep, 8).flatten()
     assert torch.equal(order[row[row >= 0]], (row >= 0).nonzero()[:, 0])
     assert (row < 0).sum() == (~keep).sum() * 64
+
+
+@pytest.mark.parametrize("tokens", ["of zero weights", "any"])
+@pytest.mark.parametrize(
+    ("head", "source"), [("paper", "predicted"), ("kinematic", "predicted"), ("kinematic", "given")]
+)
+def test_bfloat16_touches_the_transformer_alone(spheres, monkeypatch, head, source, tokens):
+    """Whatever the transformer says, its Gaussians are those in float32: no ray, head or conversion is in bfloat16."""
+    views = spheres(list(range(4)), size=32)
+    torch.manual_seed(0)
+    net = Network(Config(**TINY, head=head, source=source)).eval()
+    if tokens == "any":
+        torch.nn.init.normal_(net.decode.weight, std=0.2)
+        found = torch.randn(int(net.kept_patches(views).sum()), TINY["width"])
+        monkeypatch.setattr(net, "transform", lambda x: (found, found[:0], found[:0]))
+    else:
+        for weights in net.parameters():
+            torch.nn.init.zeros_(weights)
+    geometry, same = geometry_for(source, views), {"rtol": 0, "atol": 0, "equal_nan": True}  # zeros are no rotation
+    with torch.no_grad():
+        exact = net(views, geometry)
+        with torch.autocast("cpu", torch.bfloat16):
+            short = net(views, geometry)
+    for k in FIELDS:
+        assert getattr(short, k).dtype == torch.float32
+        torch.testing.assert_close(getattr(short, k), getattr(exact, k), **same)
+    torch.testing.assert_close(short.covariance3(), exact.covariance3(), **same)
+    if tokens == "any":
+        assert torch.linalg.eigvalsh(short.covariance3()).min() > 0
+
+
+def test_bfloat16_is_used_inside_of_the_transformer(views):
+    net, kinds = Network(Config(**TINY)).eval(), []
+    net.blocks[0].qkv.register_forward_hook(lambda module, inputs, output: kinds.append(output.dtype))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        net(views)
+    assert kinds == [torch.bfloat16]
