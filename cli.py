@@ -120,7 +120,7 @@ def train_arguments(p: argparse.ArgumentParser) -> None:
 
 def train(args: argparse.Namespace) -> int:
     """Train a network on rendered Sequences; stops by --steps or --minutes, and goes on where it stood."""
-    from .model.train import run
+    from .model.training.trainer import run
 
     return run(args)
 
@@ -144,12 +144,12 @@ def reconstruct(args: argparse.Namespace) -> int:
     import time
 
     from .datagen.sequence import read_sequence
-    from .model.asset import write_ply
-    from .model.budget import parse
-    from .model.coverage import SURFACES, coverage
+    from .model.fitting.budget import parse
+    from .model.fitting.refine import check_seconds
+    from .model.geometry.coverage import SURFACES, coverage
+    from .model.io.asset import write_ply
     from .model.reconstruct import NEEDS_PASSES, clip_of
     from .model.reconstruct import reconstruct as run
-    from .model.refine import check_seconds
     from .model.views import load_views
 
     start = time.perf_counter()
@@ -200,9 +200,9 @@ def export(args: argparse.Namespace) -> int:
     """Export an asset: USD (Gaussian splats that older readers take as points), 3DGS .ply slices, or a .blend."""
     import tempfile
 
-    from .model.asset import read_ply, write_ply
-    from .model.slices import write_slice, write_slices
-    from .model.usd import SUFFIXES, check_usd, read_moving, write_usd
+    from .model.io.asset import read_ply, write_ply
+    from .model.io.slices import write_slice, write_slices
+    from .model.io.usd_write import SUFFIXES, check_usd, read_moving, write_usd
 
     usd = args.out is not None and args.out.suffix.lower() in SUFFIXES
     if (args.out is None) == (args.sequence is None):
@@ -284,9 +284,9 @@ def evaluate(args: argparse.Namespace) -> int:
 
     from .datagen.render import Settings
     from .datagen.rigs import SETUPS
-    from .model.evaluate import evaluate_folders, find_sequences
-    from .model.lpips import HINT, LPIPS
-    from .model.protocol import TABLE, check_setup
+    from .evaluation.evaluate import evaluate_folders, find_sequences
+    from .evaluation.lpips import HINT, LPIPS
+    from .evaluation.protocol import TABLE, check_setup
 
     methods, sizes, stride = check_methods(args.methods), numbers("--size", args.size), numbers("--stride", args.stride)
     names = ",".join(TABLE) if args.setup == "all" else args.setup
@@ -355,7 +355,7 @@ def numbers(option: str, text: str) -> list[int]:
 
 def check_methods(text: str) -> list[str]:
     """A comma-separated list of methods. Raises InputError naming the unknown one and those there are."""
-    from .model.evaluate import parse_method
+    from .evaluation.evaluate import parse_method
 
     methods = [m.strip() for m in text.split(",") if m.strip()]
     for m in methods:
@@ -386,7 +386,7 @@ def bench(args: argparse.Namespace) -> int:
     on two cores. Writes into --out: bench.csv (a row for each object and way), bench.md (means, machine, what is
     on the Pareto frontiers) and bench-*.png and .svg: quality against seconds and against size, Gaussian budgets,
     numbers of views and sizes, renderer samples. A run that was stopped goes on where it was."""
-    from .benchmarks.bench import run
+    from .evaluation.bench_command import run
 
     return run(args, render_into)
 
@@ -402,7 +402,7 @@ def demo_arguments(p: argparse.ArgumentParser) -> None:
 
 def demo(args: argparse.Namespace) -> int:
     """Render an animated object, reconstruct it several ways, export it, and lay everything side by side."""
-    from .demo import run
+    from .evaluation.demo import run
 
     return run(args, save_blend)
 

@@ -20,8 +20,9 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ..datagen.sequence import InputError
-from ..model import slices, usd
-from ..model.asset import Asset, atomic, write_ply
+from ..model.io import slices
+from ..model.io import usd_write as usd
+from ..model.io.asset import Asset, atomic, write_ply
 from . import display, held, preferences, process
 from .importer import busy
 

@@ -21,8 +21,9 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatPrope
 from mathutils import Matrix, Quaternion
 
 from ..datagen.sequence import InputError
-from ..model import formats, usd
-from ..model.asset import VISIBLE, read_ply
+from ..model.io import splat_files as formats
+from ..model.io import usd_write as usd
+from ..model.io.asset import VISIBLE, read_ply
 from . import display, preferences, process
 
 LOOK_ITEMS = [

@@ -27,8 +27,8 @@ import torch
 from torch import nn
 
 from timesplat.datagen.sequence import read_sequence, sequences_in
-from timesplat.model.evaluate import draw
-from timesplat.model.metrics import psnr
+from timesplat.evaluation.evaluate import draw
+from timesplat.evaluation.metrics import psnr
 from timesplat.model.network import PRESETS, Network
 from timesplat.model.reconstruct import CHECKPOINTS, geometry_for, load_network
 from timesplat.model.views import Views, load_views

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU rasteriser of OpenSplat, the fastest third-party one found, for `benchmarks/rasterize.py --opensplat DIR`.
+"""The CPU rasteriser of OpenSplat, the fastest third-party one found, for `benchmarks/rasterizer.py --opensplat DIR`.
 
 DIR is a checkout of https://github.com/pierotofy/OpenSplat (now WebODM/OpenSplat; AGPL; nothing of it is copied here).
 Its two CPU functions of rasterizer/gsplat-cpu are compiled as they are, with -O3 -march=native; its projection has

@@ -22,7 +22,7 @@ import torch
 
 from timesplat.cli import train_arguments
 from timesplat.model.network import Network
-from timesplat.model.train import STAGES, Trainer, load_clips, make_network
+from timesplat.model.training.trainer import STAGES, Trainer, load_clips, make_network
 
 HEADER = ("network", "weights", "tokens", "steps/s", "CPU-s a step", *STAGES, "GFLOP", "floor, ms", "network is")
 

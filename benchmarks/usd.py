@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from timesplat.model.asset import ARRAYS, Asset, read_ply
-from timesplat.model.tables import machine
-from timesplat.model.usd import MODES, check_usd, read_usd, write_usd
+from timesplat.evaluation.tables import machine
+from timesplat.model.io.asset import ARRAYS, Asset, read_ply
+from timesplat.model.io.usd_write import MODES, check_usd, read_usd, write_usd
 
 
 def least(call: Callable[[], object]) -> float:

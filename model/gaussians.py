@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .asset import Asset, Clip
+from .io.asset import Asset, Clip
 
 
 class Moving(Protocol):

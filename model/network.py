@@ -25,7 +25,7 @@ from torch.utils.checkpoint import checkpoint
 from ..datagen.sequence import InputError
 from . import hexplane
 from .gaussians import Gaussians4D, Moving, isoclinic_rotation, kinematic_from_covariance
-from .lift import FEATURES, Geometry
+from .geometry.lift import FEATURES, Geometry
 from .views import Views, pluecker, rays
 
 

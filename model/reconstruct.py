@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 
 from ..datagen.sequence import InputError, Sequence
-from .asset import Clip, pixel_size
 from .gaussians import Gaussians4D, Moving
+from .io.asset import Clip, pixel_size
 from .views import Views, load_views, pad_to_multiple
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
@@ -98,9 +98,9 @@ def reconstruct_views(
     """The same from tensors; unfiltered. `seconds` is for methods that fit a scene, `progress` for what takes
     seconds; `dense`: tokens of a network everywhere, and not only where the object is."""
     if refine or budget:
-        from .budget import reduced
-        from .refine import check_seconds, start_size
-        from .refine import refine as fit
+        from .fitting.budget import reduced
+        from .fitting.refine import check_seconds, start_size
+        from .fitting.refine import refine as fit
 
         check_seconds(refine)
         near, drawing = method in NEEDS_PASSES, _draws(device)
@@ -112,16 +112,16 @@ def reconstruct_views(
             return reduced(start, views, budget, refine, **told)
         return fit(start, views, refine, drawing, near=near, progress=progress)
     if method in ("white", "hull"):
-        from .baselines import hull
+        from .baselines import visual_hull as hull
 
         return getattr(hull, method)(views)
     if method == "lift":
-        from .lift import lift
+        from .geometry.lift import lift
 
         return lift(views)
     if method in FITTED:
         from .baselines.four_dgs import four_dgs
-        from .baselines.som import som
+        from .baselines.shape_of_motion import som
 
         return {"4dgs": four_dgs, "som": som}[method](views, _draws(device), seconds, progress=progress)
     network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
@@ -146,11 +146,11 @@ def apply_network(network, views: Views, device: str = "cpu", drop_empty: bool =
 def geometry_for(source: str, views: Views):
     """The Geometry that a network with this depth source starts from (None for `predicted`)."""
     if source == "given":
-        from .lift import lift_geometry
+        from .geometry.lift import lift_geometry
 
         return lift_geometry(views)
     if source == "sweep":
-        from .sweep import sweep_geometry
+        from .geometry.plane_sweep import sweep_geometry
 
         return sweep_geometry(views)
     return None

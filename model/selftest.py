@@ -38,7 +38,7 @@ AGAIN = "install the runtime again in Timesplat's preferences"
 SIZE, FRAMES = 48, 8
 RADIUS, STEP = 0.5, np.array([0.05, 0.03, 0.02])  # of the sphere, and its way in one frame; normalised units
 HELD_OUT = Shot(4, "held_out", "target", spherical(35, 25))
-LEAST = 22.0  # dB that a reconstruction of the sphere must reach; see tests/test_selftest.py for what it does reach
+LEAST = 22.0  # dB that a reconstruction of the sphere must reach; its tests say what it reaches
 REFINE = 0.5  # seconds
 COMPILES = " (compiled now, if never before)"
 
@@ -150,8 +150,8 @@ def _USD(s) -> str:
         from pxr import Usd
     except ImportError:
         return "usd-core is not there; all but export and import of USD works"
-    from .asset import Clip
-    from .usd import check_usd, read_usd, write_usd
+    from .io.asset import Clip
+    from .io.usd_write import check_usd, read_usd, write_usd
 
     asset = s.lifted.to_asset(Clip(24.0, 0, FRAMES - 1))
     path = s.folder / "sphere.usdc"

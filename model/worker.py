@@ -104,7 +104,7 @@ def _reconstruct(request: dict, progress) -> dict:
     max_loss = request.get("max_loss", 0.1)
     if not (math.isfinite(max_loss) and max_loss > 0):
         raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
-    from .asset import write_ply
+    from .io.asset import write_ply
 
     method, refine, budget = request.get("method", "guided"), request.get("refine", 0.0), request.get("budget")
     if not (refine or budget or method in ("4dgs", "som")):
@@ -114,8 +114,8 @@ def _reconstruct(request: dict, progress) -> dict:
     from .reconstruct import clip_of, reconstruct  # imports torch
 
     if refine or budget:  # refuse now what else is found out after seconds
-        from .budget import parse
-        from .refine import check_seconds
+        from .fitting.budget import parse
+        from .fitting.refine import check_seconds
 
         check_seconds(refine)
         if budget:
@@ -155,8 +155,8 @@ def _limit_memory() -> None:
 
 def _export(request: dict, progress) -> dict:
     _limit_memory()
-    from .asset import read_ply
-    from .usd import check_usd, write_usd
+    from .io.asset import read_ply
+    from .io.usd_write import check_usd, write_usd
 
     out = Path(request["out"])
     progress(0.0, "reading the asset")
@@ -183,8 +183,8 @@ def _matrices(path: str) -> np.ndarray:
 
 def _import(request: dict, progress) -> dict:
     _limit_memory()
-    from .asset import write_ply
-    from .usd import read_moving
+    from .io.asset import write_ply
+    from .io.usd_write import read_moving
 
     progress(0.0, f"reading {Path(request['source']).name}")
     asset, motion = read_moving(request["source"])

@@ -38,8 +38,8 @@ def no_weights(tmp_path_factory):
 def steady_clock(monkeypatch):
     """A fit of so many seconds takes as many steps on every machine: each look at its clock is 10 ms later."""
     ticks = itertools.count()
-    for module in ("optimise", "refine"):
-        monkeypatch.setattr(f"timesplat.model.{module}.clock", lambda: 0.01 * next(ticks))
+    for module in ("loop", "refine"):
+        monkeypatch.setattr(f"timesplat.model.fitting.{module}.clock", lambda: 0.01 * next(ticks))
 
 
 @pytest.fixture(scope="session")

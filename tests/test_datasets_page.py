@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from timesplat.benchmarks import sheet
 from timesplat.cli import main
 from timesplat.datagen.rigs import RIGS
 from timesplat.datagen.sequence import read_sequence
+from timesplat.evaluation import contact_sheet as sheet
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs/datasets.md").read_text()
 

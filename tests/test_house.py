@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FLOORS = ("datagen", "model", "addon")
+FLOORS = ("datagen", "model", "addon", "evaluation")
 FILES = sorted([*ROOT.glob("*.py"), *(f for floor in FLOORS for f in (ROOT / floor).rglob("*.py"))])
 NAMES = [f.relative_to(ROOT).as_posix() for f in FILES]
-TORCH_FREE = ("datagen/", "addon/", "model/asset.py", "model/formats.py", "model/slices.py", "model/usd")
+TORCH_FREE = ("datagen/", "addon/", "model/io/")
 TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 
 
 def imports(name: str) -> set[str]:
     """Everything that a file imports, wherever in it: "torch.nn", or for rooms of the package the path from
-    the root on, ".model.asset" (a name imported from a package counts as a room if there is such a room)."""
+    the root on, ".model.io.asset" (a name imported from a package counts as a room if there is such a room)."""
     found, package = set(), name.split("/")[:-1]
     for node in ast.walk(ast.parse((ROOT / name).read_text(), name)):
         if isinstance(node, ast.Import):
@@ -36,12 +36,12 @@ def imports(name: str) -> set[str]:
 
 
 def rooms(name: str) -> set[str]:
-    """The rooms of the package that a file imports, like "model.asset"."""
+    """The rooms of the package that a file imports, like "model.io.asset"."""
     return {m[1:] for m in imports(name) if m.startswith(".") and m != "."}
 
 
 def test_the_walker_sees_what_it_should():
-    assert "model.asset" in rooms("addon/display.py") and "datagen.rigs" in rooms("addon/rigs.py")
+    assert "model.io.asset" in rooms("addon/display.py") and "datagen.rigs" in rooms("addon/rigs.py")
     assert "addon.display" in rooms("addon/reconstruct.py") and "torch" in imports("model/gaussians.py")
     assert "model.reconstruct" in rooms("model/worker.py")  # inside a function
 
@@ -56,8 +56,10 @@ def test_floors(name):
         assert others <= {"datagen.sequence", "datagen.rigs"}
     if floor == "addon":
         others = {r for r in told if not r.startswith(("addon", "datagen."))}
-        assert others <= {"model.asset", "model.formats", "model.slices", "model.usd"}
-    elif name != "__init__.py":
+        assert all(r.startswith("model.io") for r in others)
+    if floor not in ("cli.py", "evaluation"):
+        assert not any(r.split(".")[0] == "evaluation" for r in told), "nobody but the command line imports evaluation"
+    if floor != "addon" and name != "__init__.py":
         told -= {"addon.package"} if name == "cli.py" else set()  # builds the .zip, without bpy
         assert not any(r.split(".")[0] == "addon" for r in told), "nobody imports the add-on"
 
@@ -74,7 +76,8 @@ def test_no_torch_near_blender_and_no_blender_near_torch(name):
 
 def test_the_face_is_light():
     """The root and the torch-free rooms load without torch, bpy or pxr, the worker before it is asked."""
-    code = "import sys, timesplat, timesplat.model.asset, timesplat.model.usd, timesplat.model.worker, timesplat.cli\n"
+    rooms = ("model.io.asset", "model.io.usd_write", "model.worker", "cli")
+    code = f"import sys, {', '.join(f'timesplat.{r}' for r in rooms)}\n"
     code += "print([m for m in ('torch', 'bpy', 'pxr', 'numba', 'PIL') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"

@@ -16,9 +16,10 @@ from timesplat.addon import package, process, runtime
 from timesplat.datagen import child, sequence
 from timesplat.datagen.render import Settings, render_assets
 from timesplat.datagen.sequence import InputError, move, read_sequence
-from timesplat.model import asset, worker
+from timesplat.model import worker
+from timesplat.model.io import asset
 
-from .test_asset import make as make_asset
+from .model.io.test_asset import make as make_asset
 from .test_sequence import make as make_sequence
 
 

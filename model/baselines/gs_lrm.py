@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ...datagen.sequence import InputError
-from ..asset import Clip
 from ..gaussians import Gaussians4D
+from ..io.asset import Clip
 from ..views import Views
 
 
@@ -69,7 +69,7 @@ def per_frame(views: Views, run: Callable[[Views], Gaussians4D]) -> Slices:
     moments = views.time[shown].unique()
     clouds = [run(collapse(views[shown & (views.time == t)])).frozen(0.0) for t in moments]
     if not clouds:
-        from .hull import white
+        from .visual_hull import white
 
         return Slices(white(views), torch.zeros(0, dtype=torch.long), torch.zeros(1))
     owner = torch.arange(len(clouds)).repeat_interleave(torch.tensor([len(c) for c in clouds]))

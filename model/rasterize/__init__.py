@@ -97,7 +97,7 @@ def _rasterize(
     if backend == "cpu":
         from .cpu import rasterize as run
     elif backend == "cuda":
-        from .cuda import rasterize as run
+        from .gsplat import rasterize as run
     elif backend == "triton":
         from .triton_kernels import rasterize as run
     elif backend == "reference":

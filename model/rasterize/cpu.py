@@ -18,7 +18,7 @@ import math
 import numpy as np
 import torch
 
-from ..threads import each
+from ..parallel import each
 from . import ALPHA_MAX, T_STOP, project
 from .chain import chain
 from .project import (

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from timesplat.model.asset import Asset, Clip
+from timesplat.model.io.asset import Asset, Clip
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TARGET = os.environ.get("TIMESPLAT_BLENDER") or sys.executable

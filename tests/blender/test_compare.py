@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from timesplat.model.asset import Asset, Clip, write_ply
+from timesplat.model.io.asset import Asset, Clip, write_ply
 
 SCENE = """
 part("addon").register()

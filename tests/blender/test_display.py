@@ -11,7 +11,7 @@ import pytest
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
-from timesplat.model.asset import SH_C0, linear_from_srgb, read_ply, rotation_matrices, write_ply
+from timesplat.model.io.asset import SH_C0, linear_from_srgb, read_ply, rotation_matrices, write_ply
 
 from .helpers import make
 
@@ -377,7 +377,7 @@ def test_splats_are_rendered_as_the_formula_says(blender, tmp_path):
 def test_the_clip_is_placed_on_fractional_rates(blender):
     code = """
     from timesplat.addon.display import play_clip
-    from timesplat.model.asset import Clip
+    from timesplat.model.io.asset import Clip
     rates = []
     for fps in (24.0, 23.976, 29.97, 12.5, 0.5, 120.0):
         play_clip(bpy.context.scene, Clip(fps, 3, 9))

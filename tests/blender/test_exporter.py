@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from timesplat.model import formats
-from timesplat.model.asset import ARRAYS, VISIBLE, read_ply, rotation_matrices, write_ply
+from timesplat.model.io import splat_files as formats
+from timesplat.model.io.asset import ARRAYS, VISIBLE, read_ply, rotation_matrices, write_ply
 
 from .helpers import CLIP, make
 
@@ -219,7 +219,7 @@ tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)),
 def test_an_object_that_moves(blender, folder):
     """USD has its motion, in every mode and through its way back; a .ply has where it is now."""
     pytest.importorskip("pxr")
-    from timesplat.model import usd
+    from timesplat.model.io import usd_write as usd
 
     code = """
 from mathutils import Euler, Matrix
@@ -270,7 +270,7 @@ tell(done=done, want=want, got=got, said=said, keyed=bool(bpy.context.object.ani
 
 def test_usd_is_written_checked_and_read_again(blender, folder):
     pytest.importorskip("pxr")
-    from timesplat.model import usd
+    from timesplat.model.io import usd_write as usd
 
     code = """
 import importlib.util

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from timesplat.model import slices
-from timesplat.model.asset import ARRAYS, VISIBLE, read_ply, write_ply
+from timesplat.model.io import slices
+from timesplat.model.io.asset import ARRAYS, VISIBLE, read_ply, write_ply
 
 from .helpers import make
 
@@ -99,7 +99,7 @@ tell(**result)
 
 def test_usd_through_the_worker_and_directly(blender, tmp_path):
     """Where there is no worker Blender's own pxr reads it; the arrays are the same."""
-    usd = pytest.importorskip("timesplat.model.usd")
+    usd = pytest.importorskip("timesplat.model.io.usd_write")
     pytest.importorskip("pxr")
     asset = make(50)
     usd.write_usd(tmp_path / "a.usdz", asset)

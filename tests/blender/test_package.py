@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from timesplat.model.asset import read_ply, write_ply
+from timesplat.model.io.asset import read_ply, write_ply
 
 from .helpers import REAL, ROOT, TARGET, make
 
 ALLOWED = [
-    *("__init__.py", "LICENSE", "README.md", "blender_manifest.toml", "cli.py", "demo.py"),
-    *("addon/*.py", "datagen/*.py", "model/*.py", "model/baselines/*.py", "model/rasterize/*.py"),
+    *("__init__.py", "LICENSE", "README.md", "blender_manifest.toml"),
+    *("addon/*.py", "datagen/*.py", "model/*.py", "model/fitting/*.py", "model/geometry/*.py", "model/io/*.py"),
+    *("model/rasterize/*.py",),
     *("model/checkpoints/*.safetensors", "model/checkpoints/*.md"),
 ]
 NEEDED = {

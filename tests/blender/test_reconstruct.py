@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from timesplat.model.asset import read_ply
+from timesplat.model.io.asset import read_ply
 
 ANIMATE = """
 import time
@@ -216,7 +216,7 @@ def test_what_the_settings_select(blender):
     assert told["said"] == [
         "Front, left, back, right in turn", "5 selected cameras", "5 cameras of the rig", "1 selected camera",
     ]  # fmt: skip
-    from timesplat.model.refine import NEAR_FEW
+    from timesplat.model.fitting.refine import NEAR_FEW
 
     counts = told["counts"]  # five pictures
     assert counts["ALL 0 128"][0] == round(0.19 * 5 * 128**2) and counts["SHARE 0 128"][0] == round(0.019 * 5 * 128**2)

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from timesplat.model import slices
-from timesplat.model.asset import Clip, read_ply, write_ply
-from timesplat.model.usd import check_usd, write_usd
+from timesplat.model.io import slices
+from timesplat.model.io.asset import Clip, read_ply, write_ply
+from timesplat.model.io.usd_write import check_usd, write_usd
 
 from .helpers import REAL, TARGET, make
 from .window import Window, missing

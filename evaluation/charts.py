@@ -1,0 +1,373 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The pictures and the page of `timesplat bench`, from its bench.csv alone: `draw(Path("out/bench/bench.csv"))`.
+
+Beside the CSV: bench.md, bench-seconds, bench-size, bench-budgets and bench-inputs as SVG and PNG (those there are
+figures for), and bench-renderer from a bench-renderer.csv. Squares see depth and motion, circles RGB alone; ours are
+filled, baselines hollow. Bars are standard errors over objects of the paired differences to the way at the centre that
+sees the same (`guided`, `rgb`), which has none itself.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from ..benchmarks.renderer import COLUMNS as RENDERER
+from ..benchmarks.renderer import TRUTH
+from ..datagen.sequence import InputError
+from .bench import FIGURES
+from .evaluate import parse_method
+from .figures import COLOURS, MARKERS, panels, replace, save
+from .labels import plain, settle
+from .pareto import Mean, frontier, read_csv, summarise
+
+BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, BLACK, GREY = COLOURS
+FAMILIES = {"lift": BLACK, "guided": BLUE, "rgb": ORANGE, "sweep": ORANGE, "predicted": PINK, "gs-lrm-all": YELLOW}
+FAMILIES |= {"gs-lrm-frame": YELLOW, "hull": GREY, "white": GREY, "4dgs": GREEN, "som": SKY}
+SEES = {True: "depth + motion", False: "RGB alone"}
+NAMES = {"seconds": "seconds of one thread", "gaussians": "Gaussians", "ply_mb": "megabytes of the .ply"}
+NAMES |= {
+    "usd_mb": "megabytes of the .usdc",
+    "psnr": "PSNR of novel views (dB)",
+    "flip": "FLIP of novel views (upside down: up is better)",
+}
+
+
+def draw(path: Path) -> str:
+    """bench.md and the pictures beside a bench.csv -> the table of frontiers. Raises InputError for another file."""
+    rows, command, facts = read_csv(path)
+    setup, size = facts["centre"]
+    means = summarise(rows, (setup, size))
+    centre = [m for m in means if (m.setup, m.size) == (setup, size)]
+    pictures = []
+    for name, costs, worths in (
+        ("seconds", ("seconds", "seconds"), ("psnr", "flip")),
+        ("size", ("gaussians", "usd_mb" if any(m.mean["usd_mb"] for m in centre) else "ply_mb"), ("psnr", "psnr")),
+    ):
+        fig, axes = panels(2, 5.6, 4.8)
+        work = [trade(ax, centre, c, w) for ax, c, w in zip(axes, costs, worths, strict=True)]
+        key(axes[0], centre)
+        settle(fig, work)
+        pictures.append(_save(fig, path, name, command))
+    losses = budgets(rows, (setup, size))
+    if losses:
+        pictures.append(_save(draw_budgets(losses), path, "budgets", command))
+    if len(means) > len(centre):
+        pictures.append(_save(draw_inputs(means, setup, size), path, "inputs", command))
+    renderer = path.with_name(f"{path.stem}-renderer.csv")
+    if renderer.is_file():
+        pictures.append(draw_renderer(renderer))
+    replace(path.with_suffix(".md"), page(means, centre, rows, command, facts, pictures).encode())
+    return frontiers(centre)
+
+
+def _save(fig, path: Path, name: str, command: str) -> str:
+    stem = path.with_name(f"{path.stem}-{name}")
+    save(fig, stem, command)
+    return stem.name
+
+
+# ---------------------------------------------------------------- one way against another
+
+
+def kind(m: Mean) -> tuple:
+    """What a line joins: fits of one method for several seconds, refinements of one, budgets of one."""
+    spec = parse_method(m.way.spec)
+    what = "budget" if spec.budget else "dense" if spec.dense else ""
+    return m.way.name, m.way.weights, what, spec.refine if spec.budget else None
+
+
+def lines(means: list[Mean]) -> dict[str, list[Mean]]:
+    """{label: points that a line joins, in its order}; single points too. A line of budgets starts at what it is a
+    budget of."""
+    found: dict[tuple, list[Mean]] = {}
+    for m in means:
+        found.setdefault(kind(m), []).append(m)
+    out = {}
+    for (name, weights, what, refine), group in found.items():
+        head = f"{name}@{weights}" if weights else name
+        if what == "budget":
+            whole = f"{head}+refine:{refine:g}" if refine else head
+            group = [m for m in means if m.way.label == whole] + group
+            out[f"{whole}+budget"] = sorted(group, key=lambda m: m.mean["gaussians"])
+        elif what == "dense":
+            out |= {m.way.label: [m] for m in group}
+        else:
+            refined = len(group) > 1 and name not in ("4dgs", "som")
+            out[f"{head}+refine" if refined else head] = sorted(group, key=lambda m: m.way.fit)
+    return out
+
+
+def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
+    """A panel: what ways cost (log) and are worth, with lines and both frontiers; -> what `place` takes. FLIP is drawn
+    upside down, so that up is better."""
+    means = [m for m in means if m.mean[cost]]
+    ax.set(xscale="log", xlabel=NAMES[cost], ylabel=NAMES[worth])
+    labels, hints, drawn = [], [], []
+    for label, group in lines(means).items():
+        x, y = [m.mean[cost] for m in group], [m.mean[worth] for m in group]
+        colour, budget = FAMILIES[group[0].way.name], "budget" in label
+        ax.plot(x, y, color=colour, linewidth=1, zorder=2, linestyle="--" if budget else "-")
+        drawn.append((x, y))
+        at = 0 if budget else -1
+        labels.append((x[at], y[at], label, colour))
+        if "refine" in label and not budget:
+            labels.append((x[0], y[0], group[0].way.label, colour))
+        if cost != "seconds":
+            said = {h[:3] for h in hints}
+            found = [(a, b, hint(m), colour) for a, b, m in zip(x, y, group, strict=True)]
+            hints += [h for h in found if h[2] and h[:3] not in said]
+    for m in means:
+        x, y, colour, error = m.mean[cost], m.mean[worth], FAMILIES[m.way.name], m.gain_error.get(worth, 0)
+        drawn.append(([x, x], [y - error, y + error]))
+        ax.errorbar(
+            x, y, yerr=error or None, color=colour, ecolor=colour, elinewidth=0.8, capsize=2, linestyle="none",
+            marker="s" if m.way.passes else "o", zorder=4,
+            markersize=3 if cost == "seconds" and "budget" in m.way.spec else 5,
+            markerfacecolor="white" if m.way.baseline else colour,
+        )  # fmt: skip
+    for passes in (True, False):
+        best = on_frontier([m for m in means if m.way.passes == passes], cost, worth)
+        x, y = [m.mean[cost] for m in best], [m.mean[worth] for m in best]
+        look = {"color": "#606060", "drawstyle": "steps-post", "zorder": 1}
+        ax.plot(x, y, linewidth=5, alpha=0.15, **look)
+        ax.plot(x, y, linewidth=0.9, linestyle="-" if passes else ":", **look)
+        drawn.append((np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]))
+    ax.margins(0.12, 0.08)
+    if worth == "flip":
+        ax.invert_yaxis()
+    plain(ax)
+    dots = [(m.mean[cost], m.mean[worth]) for m in means]
+    return ax, labels, hints, drawn, dots
+
+
+def hint(m: Mean) -> str:
+    """What tells a point from the others of its line, where the x axis does not."""
+    spec = parse_method(m.way.spec)
+    return spec.budget or (f"{m.way.fit:g} s" if m.way.fit else "")
+
+
+def on_frontier(means: list[Mean], cost: str, worth: str) -> list[Mean]:
+    """Those on the Pareto frontier, cheapest first; FLIP counts as better when it is less."""
+    means = [m for m in means if m.mean[cost] is not None]
+    sign = -1 if worth == "flip" else 1
+    return [means[i] for i in frontier([m.mean[cost] for m in means], [sign * m.mean[worth] for m in means])]
+
+
+def key(ax, means: list[Mean]) -> None:
+    """What the markers and the grey lines mean, above a panel."""
+    from matplotlib.lines import Line2D
+
+    made, look = [], {"color": "#404040", "linestyle": "none", "markersize": 5}
+    for passes in (True, False):
+        if any(m.way.passes == passes for m in means):
+            mark, style = ("s", "-") if passes else ("o", ":")
+            made.append(Line2D([], [], marker=mark, label=f"sees {SEES[passes]}", **look))
+            made.append(Line2D([], [], color="#606060", linestyle=style, label="its Pareto frontier"))
+    if any(m.way.baseline for m in means):
+        made.append(Line2D([], [], marker="o", markerfacecolor="white", label="hollow: baselines", **look))
+    legend = ax.legend(handles=made, fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=5, columnspacing=1)
+    legend.set_in_layout(False)
+    ax.set_title(" ", fontsize=9)  # room for it
+
+
+# ---------------------------------------------------------------- budgets, inputs, the renderer
+
+
+def budgets(rows: list[dict], centre: tuple[str, int]) -> dict[str, dict[str, list[tuple[float, float, bool]]]]:
+    """{way without a budget: {object: [(Gaussians, dB won over no budget, whether it is auto)] by size}}."""
+    here = {(r["way"], r["object"]): r for r in rows if (r["setup"], r["size"]) == tuple(centre)}
+    out: dict = {}
+    for (label, name), r in here.items():
+        whole, _, amount = label.partition("+budget:")
+        if amount and (whole, name) in here:
+            full = here[whole, name]
+            curve = out.setdefault(whole, {}).setdefault(name, [(full["gaussians"], 0.0, False)])
+            curve.append((r["gaussians"], r["psnr"] - full["psnr"], amount == "auto"))
+    return {w: {n: sorted(c) for n, c in curves.items()} for w, curves in out.items()}
+
+
+def draw_budgets(losses: dict):
+    """A panel for each way: what an object loses when it has fewer Gaussians; a star is what `auto` chose."""
+    fig, axes = panels(len(losses), 5.6, 4.2)
+    work = []
+    for ax, (whole, curves) in zip(axes, losses.items(), strict=True):
+        labels, drawn = [], []
+        for i, (name, curve) in enumerate(curves.items()):
+            colour, (n, gain, _) = COLOURS[i % len(COLOURS)], zip(*curve, strict=True)
+            ax.plot(n, gain, color=colour, marker=MARKERS[i % 5], markersize=3.5, linewidth=1.1)
+            whole_n = [a for a, b, star in curve if b == 0 and not star]
+            ax.plot(whole_n[:1], [0], marker="o", markersize=7, color=colour, markerfacecolor="white", zorder=1.9)
+            stars = [(a, b) for a, b, star in curve if star]
+            ax.plot(*zip(*stars, strict=True), marker="*", markersize=9, color=colour, linestyle="none") if stars else 0
+            labels.append((n[0], gain[0], name, colour))
+            drawn.append((n, gain))
+        ax.set(
+            xscale="log", xlabel="Gaussians (star: budget auto; ring: no budget)", ylabel="PSNR against no budget (dB)"
+        )
+        ax.margins(0.14, 0.1)
+        plain(ax)
+        ax.set_title(whole, fontsize=9)
+        work.append((ax, labels, [], drawn, [(a, b) for xs, ys in drawn for a, b in zip(xs, ys, strict=True)]))
+    settle(fig, work)
+    return fig
+
+
+def draw_inputs(means: list[Mean], setup: str, size: int):
+    """PSNR and seconds over the number of views, and PSNR against seconds at sizes in pixels."""
+    by_views = [m for m in means if m.size == size and (m.setup == setup or m.setup.startswith("views-"))]
+    by_size = [m for m in means if m.setup == setup]
+    chosen = [w for w in dict.fromkeys(m.way.label for m in means) if any(
+        m.way.label == w and (m.setup, m.size) != (setup, size) for m in means)]  # fmt: skip
+    plans = [("views", "psnr", by_views), ("views", "seconds", by_views), ("seconds", "psnr", by_size)]
+    plans = [p for p in plans if len({(m.setup, m.size) for m in p[2]}) > 1]
+    fig, axes = panels(len(plans), 4.6, 4.2)
+    work = []
+    for ax, (x_name, y_name, part) in zip(axes, plans, strict=True):
+        labels, hints, drawn = [], [], []
+        for w in chosen:
+            line = sorted((m for m in part if m.way.label == w), key=lambda m: (m.views, m.size))
+            x = [m.views if x_name == "views" else m.mean["seconds"] for m in line]
+            y, way, colour = [m.mean[y_name] for m in line], line[0].way, FAMILIES[line[0].way.name]
+            ax.plot(
+                x, y, color=colour, linewidth=1.2, marker="s" if way.passes else "o", markersize=4.5,
+                linestyle="--" if "refine" in w else "-", markerfacecolor="white" if way.baseline else colour,
+            )  # fmt: skip
+            labels.append((x[-1], y[-1], w, colour))
+            hints += [(a, b, f"{m.size}²", colour) for a, b, m in zip(x, y, line, strict=True) if x_name != "views"]
+            drawn.append((x, y))
+        label = "input views" if x_name == "views" else "seconds of one thread (truth at the same size)"
+        ax.set(xscale="log", xlabel=label, ylabel=NAMES[y_name])
+        ax.set_yscale("log" if y_name == "seconds" else "linear")
+        ax.margins(0.18, 0.1)
+        plain(ax)
+        if x_name == "views":
+            ticks = sorted({m.views for m in part})
+            ax.set_xticks(ticks, [str(t) for t in ticks])
+            ax.minorticks_off()
+        if y_name == "seconds":
+            plain(ax, ax.yaxis)
+        work.append((ax, labels, hints, drawn, [(a, b) for xs, ys in drawn for a, b in zip(xs, ys, strict=True)]))
+    settle(fig, work)
+    return fig
+
+
+def write_renderer(path: Path, rows: list[dict], command: str) -> None:
+    """bench-renderer.csv, after a comment with the command."""
+    text = io.StringIO()
+    text.write(f"# {command}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(RENDERER)
+    writer.writerows([[f"{r[k]:.5g}" if isinstance(r[k], float) else r[k] for k in RENDERER] for r in rows])
+    replace(path, text.getvalue().encode())
+
+
+def draw_renderer(path: Path) -> str:
+    """The picture beside a bench-renderer.csv: Cycles samples against seconds an image and PSNR. -> its stem."""
+    try:
+        head, *rest = path.read_text().splitlines()
+        rows = [(r["object"], int(r["samples"]), float(r["seconds"]), float(r["psnr"])) for r in csv.DictReader(rest)]
+        if not rows:
+            raise ValueError
+    except (ValueError, KeyError, TypeError):
+        raise InputError(
+            f"{path}: not a whole bench-renderer.csv; remove it and run `timesplat bench` again."
+        ) from None
+    fig, (ax,) = panels(1, 5.6, 4.2)
+    labels, hints, drawn = [], [], []
+    for i, (name, group) in enumerate(groupby(rows, key=lambda r: r[0])):
+        _, n, x, y = zip(*group, strict=True)
+        ax.plot(x, y, color=COLOURS[i], marker="os"[i % 2], markersize=4.5, linewidth=1.2)
+        labels.append((x[-1], y[-1], name, COLOURS[i]))
+        hints += [(a, b, str(k), COLOURS[i]) for a, b, k in zip(x, y, n, strict=True)]
+        drawn.append((x, y))
+    ax.set(xscale="log", xlabel="seconds an image of one thread; numbers: Cycles samples")
+    ax.set_ylabel(f"PSNR to {TRUTH} samples (dB)")
+    ax.margins(0.14, 0.1)
+    plain(ax)
+    settle(fig, [(ax, labels, hints, drawn, [(a, b) for xs, ys in drawn for a, b in zip(xs, ys, strict=True)])])
+    save(fig, path.with_suffix(""), head.removeprefix("# "))
+    return path.stem
+
+
+# ---------------------------------------------------------------- the page
+
+
+def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, facts: dict, pictures: list) -> str:
+    """bench.md."""
+    setup, size = facts["centre"]
+    machine, versions = facts["machine"], facts["versions"]
+    names = list(dict.fromkeys(r["object"] for r in rows))
+    most = max(m.count for m in means)
+    short = sorted({r["way"] for r in rows} - {m.way.label for m in means})
+    seen = f"the setup `{setup}`" if setup else "all views that are not held out"
+    what = [
+        f"{most} objects ({', '.join(names)}); centre: {seen}, {size}x{size} pixels; scored on held-out views.",
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['system']}; Python {versions['python']}, torch "
+        f"{versions['torch']}; {facts['date']}. {facts['jobs']} runs at a time, one core and one thread each; the "
+        f"whole took {facts['seconds_total'] / 60:.1f} minutes by the clock.",
+        *facts["notes"],
+    ]
+    if short:
+        what.append(f"Left out, for not all objects were reached in the time given: {', '.join(short)}.")
+    parts = [
+        "# Speed against accuracy",
+        f"`{command}`",
+        facts.get("made_by", ""),
+        *what,
+        "## Pareto frontiers",
+        frontiers(centre),
+    ]
+    parts += [f"![{p}]({p}.png)" for p in pictures]
+    others = [m for m in means if m not in centre]
+    parts += ["## At the centre", table(centre)] + (["## Other inputs and sizes", table(others)] if others else [])
+    parts.append(
+        "± is the standard error over objects. Gain: PSNR against the way at the centre that sees the same (`guided`, "
+        "or `rgb`), object by object, with the standard error of that difference; these are the bars in the pictures. "
+        "Seconds: from views in memory to Gaussians, of one thread. FLIP: less is better. Gaussians: those that the "
+        "paper's inference filters keep. No megabytes where a scene is no 4D Gaussians. Drawing: milliseconds a view "
+        "at this size. Coverage: what share of the object the input views show, by the way's own Gaussians "
+        "(`model.coverage`). +dense: tokens of the network everywhere, not only where the object is."
+    )
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def frontiers(centre: list[Mean]) -> str:
+    """A Markdown table of what is on each frontier, and which of it are baselines."""
+    lines = ["| frontier | among ways that see | on it, cheapest first | baselines on it |", "|---|---|---|---|"]
+    for worth, cost in (("psnr", "seconds"), ("flip", "seconds"), ("psnr", "gaussians"), ("psnr", "usd_mb")):
+        if not any(m.mean[cost] for m in centre):
+            continue
+        for sees in (True, False, None):
+            group = [m for m in centre if sees is None or m.way.passes == sees]
+            if not group or (sees is None and len({m.way.passes for m in centre}) == 1):
+                continue
+            best = on_frontier(group, cost, worth)
+            base = ", ".join(m.way.label for m in best if m.way.baseline) or "none"
+            cells = [f"{worth.upper()} / {NAMES[cost]}", "either" if sees is None else SEES[sees]]
+            lines.append("| " + " | ".join([*cells, ", ".join(m.way.label for m in best), base]) + " |")
+    return "\n".join(lines)
+
+
+def table(means: list[Mean]) -> str:
+    digits = dict(zip(FIGURES, (2, 2, 2, 3, 3, 0, 2, 2, 1, 2), strict=True))
+    heads = ["way", "sees", "views", "size", "seconds", "PSNR", "gain", "PSNR fg", "SSIM", "FLIP", "Gaussians"]
+    heads += [".ply MB", ".usdc MB", "drawing ms", "coverage"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+
+    def cell(value: float | None, error: float, n: int, signed: bool = False) -> str:
+        if value is None:
+            return "–"
+        return f"{value:{'+' if signed else ''}.{n}f}" + (f" ± {error:.{n}f}" if error else "")
+
+    for m in means:
+        figures = {k: cell(m.mean[k], m.error[k] if k in ("psnr", "flip") else 0, digits[k]) for k in FIGURES}
+        gain = cell(m.gain.get("psnr"), m.gain_error.get("psnr", 0), 2, True)
+        first = [m.way.label, SEES[m.way.passes], str(m.views), str(m.size), figures["seconds"], figures["psnr"]]
+        last = [figures[k] for k in FIGURES[2:]]
+        lines.append("| " + " | ".join([*first, gain, *last]) + " |")
+    return "\n".join(lines)

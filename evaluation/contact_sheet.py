@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A contact sheet of a Sequence, to judge a data set by eye: every camera over time, and where there are passes its
+first camera's depth (near is dark) and motion (hue is the direction, saturation the length).
+
+    python -m timesplat.evaluation.contact_sheet data/fox/fox/Run sheet.png --frames 8
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..datagen.sequence import InputError, Sequence, read_sequence
+from ..model.views import load_views
+from .figures import replace
+from .pictures import grid
+
+
+def sheet(seq: Sequence, frames: int):
+    """-> PIL image: a row a camera, `frames` columns evenly spread over the clip."""
+    chosen = np.unique(np.linspace(seq.frame_start, seq.frame_end, frames).round().astype(int))
+    cameras: dict[str, dict[int, int]] = {}
+    rigs: dict[str, set] = {}
+    for v in seq.views:
+        rigs.setdefault(v.camera, set()).add(v.rig)
+    for i, v in enumerate(seq.views):
+        name = v.camera if len(rigs[v.camera]) == 1 else f"{v.camera}, {v.rig}"
+        cameras.setdefault(name, {})[v.frame] = i
+    rows, first = {}, None
+    for name, at in cameras.items():
+        indices = [at.get(f) for f in chosen]
+        if any(i is not None for i in indices):
+            rows[name] = torch.stack([_picture(seq, i) for i in indices])
+            first = first or (name, [i for i in indices if i is not None] if None not in indices else [])
+    name, indices = first
+    if indices and all(seq.views[i].passes for i in indices):
+        views = load_views(seq, indices, passes=True)
+        rows[f"depth, {name}"] = _depth(views.depth)
+        rows[f"motion, {name}"] = _motion(views.flow[..., :2])
+    return grid(rows, [f"frame {f}" for f in chosen])
+
+
+def _picture(seq: Sequence, index: int | None) -> torch.Tensor:
+    if index is None:  # this camera took none then
+        return torch.full((seq.height, seq.width, 3), 0.85)
+    return load_views(seq, [index]).over()[0]
+
+
+def _depth(depth: torch.Tensor) -> torch.Tensor:
+    """depth (n,H,W), infinite behind the object -> (n,H,W,3) grey values, white there."""
+    near, far = depth[depth.isfinite()].aminmax()
+    grey = ((depth - near) / (far - near).clamp(min=1e-6) * 0.8).nan_to_num(1.0, 1.0, 1.0)
+    return torch.where(depth.isfinite(), grey, 1.0)[..., None].expand(-1, -1, -1, 3)
+
+
+def _motion(flow: torch.Tensor) -> torch.Tensor:
+    """flow (n,H,W,2) in pixels a frame -> (n,H,W,3)."""
+    from matplotlib.colors import hsv_to_rgb
+
+    flow = flow.nan_to_num(0).numpy()
+    length = np.linalg.norm(flow, axis=-1)
+    hue = (np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi)) % 1
+    most = max(float(np.percentile(length[length > 0], 98)) if (length > 0).any() else 1.0, 1e-6)
+    saturation = np.clip(length / most, 0, 1)
+    return torch.from_numpy(hsv_to_rgb(np.stack([hue, saturation, np.ones_like(hue)], -1)).astype(np.float32))
+
+
+def main(argv: list[str] | None = None) -> int:
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote")
+    p.add_argument("out", type=Path, help=".png to write")
+    p.add_argument("--frames", type=int, default=8, help="columns (default: 8)")
+    args = p.parse_args(argv)
+    try:
+        data = io.BytesIO()
+        sheet(read_sequence(args.sequence), args.frames).save(data, "PNG", optimize=True)
+        replace(args.out, data.getvalue())
+    except InputError as e:
+        print(f"timesplat: {e}", file=sys.stderr)
+        return 2
+    print(args.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

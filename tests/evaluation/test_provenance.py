@@ -1,0 +1,31 @@
+"""Where figures come from: revision, uncommitted changes, hashes."""
+
+import subprocess
+
+from timesplat.evaluation.provenance import Provenance, revision
+
+
+def git(folder, *words):
+    who = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+    return subprocess.check_output(["git", "-C", str(folder), *who, *words], text=True).strip()
+
+
+def test_a_checkout_is_named_and_its_changes_are_seen(tmp_path):
+    assert revision(tmp_path) == (None, None)
+    git(tmp_path, "init", "-q")
+    (tmp_path / "a").write_text("1")
+    git(tmp_path, "add", "a")
+    git(tmp_path, "commit", "-qm", "first")
+    head = git(tmp_path, "rev-parse", "HEAD")
+    assert revision(tmp_path) == (head[:12], True)
+    (tmp_path / "a").write_text("2")
+    assert revision(tmp_path) == (head[:12], False)
+    (tmp_path / "inside").mkdir()
+    assert revision(tmp_path / "inside") == (None, None)  # somebody else's checkout
+
+
+def test_checkpoints_are_told_apart_by_their_bytes(tmp_path):
+    (tmp_path / "a.safetensors").write_bytes(b"abc")
+    made = Provenance.of("timesplat x", [tmp_path / "a.safetensors", tmp_path / "none.safetensors"])
+    assert made.checkpoints == {"a.safetensors": "ba7816bf8f01"}  # of SHA-256("abc"), FIPS 180-2
+    assert "a.safetensors ba7816bf8f01" in str(made)

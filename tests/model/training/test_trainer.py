@@ -1,0 +1,203 @@
+"""Training: a loss that falls, exact resume, and what is not sound left out."""
+
+import argparse
+import json
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from timesplat.cli import train_arguments
+from timesplat.datagen.sequence import InputError
+from timesplat.model.network import PRESETS, Config, Network
+from timesplat.model.training.dataset import Clips
+from timesplat.model.training.optimizers import learning_rate, make_optimisers, take_step
+from timesplat.model.training.trainer import Trainer, run
+from timesplat.model.training.vgg import VGG
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", Config(width=32, depth=1, heads=2))
+
+
+def arguments(folder, out, *more) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    train_arguments(parser)
+    cache = out.parent / "cache"
+    words = [str(folder), "--out", str(out), "--cache", str(cache), "--targets", "2", "--views", "4", *more]
+    return parser.parse_args(words)
+
+
+@pytest.mark.parametrize("source", ["given", "sweep", "predicted"])
+def test_loss_falls(sphere_folder, tmp_path, source):
+    args = arguments(sphere_folder.parent, tmp_path / "run", "--source", source, "--steps", "40", "--rate", "3e-3")
+    args.geometric = 0.3
+    assert run(args) == 0
+    lines = [json.loads(x) for x in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert lines[-1]["step"] == 40 and lines[-1]["loss"] < lines[0]["loss"]
+    assert lines[-1]["skipped"] == lines[-1]["bad"] == 0
+    assert lines[-1]["cpu_seconds"] > 0 and lines[-1]["memory"] > 50
+    assert sum(lines[-1]["share"].values()) == pytest.approx(1, abs=0.03)
+
+
+def test_an_interrupted_run_goes_on_exactly(sphere_folder, tmp_path, monkeypatch):
+    """Ten steps, Ctrl-C, and ten more equal twenty, in the weights, their average and the optimisers."""
+    folder = sphere_folder.parent
+    more = ("--steps", "20", "--source", "predicted", "--optimiser", "muon", "--accumulate", "2")
+    assert run(arguments(folder, tmp_path / "whole", *more)) == 0
+    step = Trainer.train_step
+
+    def interrupted(self, shares):
+        if self.step == 9:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, shares)
+
+    with monkeypatch.context() as m, pytest.raises(KeyboardInterrupt):
+        m.setattr(Trainer, "train_step", interrupted)
+        run(arguments(folder, tmp_path / "parts", *more))
+    assert load(tmp_path / "parts")["progress"]["step"] == 10
+    run(arguments(folder, tmp_path / "parts", *more))
+    parts, whole = load(tmp_path / "parts"), load(tmp_path / "whole")
+    for state in (parts, whole):
+        state["optimisers"] = [o["state"] for o in state["optimisers"]]
+    for kind in ("network", "average", "optimisers"):
+        torch.testing.assert_close(parts[kind], whole[kind], rtol=0, atol=0)
+
+
+def load(folder) -> dict:
+    return torch.load(folder / "state.pt", weights_only=True)
+
+
+@pytest.mark.parametrize("sampling", ["paper", "static"])
+def test_every_sampling_trains(sphere_folder, tmp_path, sampling):
+    args = arguments(sphere_folder.parent, tmp_path / "run", "--sampling", sampling, "--steps", "2", "--head", "paper")
+    args.source, args.views, args.targets = "predicted", None, None
+    assert run(args) == 0
+    assert load(tmp_path / "run")["progress"]["bad"] == 0
+
+
+def test_training_starts_from_static_weights(sphere_folder, tmp_path):
+    """As the paper's does from GS-LRM; a network of another kind is refused in one sentence."""
+    folder, more = sphere_folder.parent, ("--source", "predicted", "--steps", "1", "--rate", "0")
+    run(arguments(folder, tmp_path / "still", *more, "--static"))
+    start = tmp_path / "still" / "network.safetensors"
+    run(arguments(folder, tmp_path / "moving", *more, "--init", str(start)))
+    a, b = load(tmp_path / "still")["network"], load(tmp_path / "moving")["network"]
+    for k in a:
+        torch.testing.assert_close(a[k].half().float(), b[k], rtol=0, atol=0)
+    with pytest.raises(InputError, match="head"):
+        run(arguments(folder, tmp_path / "other", *more, "--head", "paper", "--init", str(start)))
+
+
+@pytest.fixture
+def trainer(sphere_folder, tmp_path):
+    """trainer(*words) -> a Trainer at the start of a run on the spheres."""
+
+    def make(*words) -> Trainer:
+        args = arguments(sphere_folder.parent, tmp_path / "run", "--source", "predicted", *words)
+        torch.manual_seed(0)
+        config = replace(PRESETS["tiny"], head=args.head, source=args.source)
+        return Trainer(Network(config), Clips(args.data, args.cache), args)
+
+    return make
+
+
+def test_bad_samples_are_left_out_and_counted(trainer, monkeypatch):
+    t = trainer("--accumulate", "2")
+    before = {k: v.clone() for k, v in t.network.state_dict().items()}
+    forward = Network.forward
+    count = iter(range(10))
+
+    def poisoned(self, *inputs):
+        g = forward(self, *inputs)
+        return g.map(lambda x: x * float("nan")) if next(count) in (0, 2, 3) else g
+
+    monkeypatch.setattr(Network, "forward", poisoned)
+    loss, _ = t.train_step(np.zeros(4))  # one of two samples is good
+    after = {k: v.clone() for k, v in t.network.state_dict().items()}
+    assert np.isfinite(loss) and t.bad == 1 and t.skipped == 0
+    assert any((before[k] != after[k]).any() for k in after)
+    loss, _ = t.train_step(np.zeros(4))  # none is
+    assert np.isnan(loss) and t.bad == 3
+    for k, v in t.network.state_dict().items():
+        assert torch.equal(v, after[k])
+
+
+@pytest.mark.parametrize("size,warm,steps", [(1e3, True, False), (1e3, False, True), (float("nan"), False, False)])
+def test_a_wild_gradient_changes_nothing(size, warm, steps):
+    network = torch.nn.Linear(2, 2)
+    network.blocks = torch.nn.ModuleList()
+    optimisers = make_optimisers(network, "adamw")
+    before = network.weight.clone()
+    network.weight.grad = torch.full((2, 2), size)
+    assert take_step(optimisers, 0.1, warm) == steps
+    assert torch.equal(network.weight, before) != steps and network.weight.grad is None
+
+
+def test_the_rate_warms_up_and_falls_to_zero():
+    assert learning_rate(1.0, 0, 100, 0.0) == pytest.approx(0.01)
+    assert learning_rate(1.0, 99, 100, 0.0) == pytest.approx(1)
+    assert learning_rate(1.0, 500, 100, 0.5) == pytest.approx(0.5)
+    assert learning_rate(1.0, 999, 100, 1.0) == pytest.approx(0)
+
+
+def test_muon_takes_the_matrices_of_the_blocks():
+    """Orthogonal steps for them, of about AdamW's size; everything else is AdamW's."""
+    network = Network(Config(width=32, depth=2, heads=2))
+    adamw, muon = make_optimisers(network, "muon")
+    (group,) = muon.param_groups
+    assert {p.data_ptr() for p in group["params"]} == {
+        p.data_ptr() for n, p in network.named_parameters() if n.startswith("blocks") and p.ndim == 2
+    }
+    assert sum(len(g["params"]) for g in [*adamw.param_groups, group]) == len(list(network.parameters()))
+    p = network.blocks[0].qkv.weight
+    before = p.detach().clone()
+    for q in network.parameters():
+        q.grad = torch.randn_like(q)
+    assert take_step([adamw, muon], 0.01, warm=False)
+    step = (p.detach() - before) / 0.01
+    assert float(step.square().mean().sqrt()) == pytest.approx(0.2, rel=0.3)
+    values = torch.linalg.svdvals(step)
+    assert values.max() / values.min() < 4
+
+
+def test_damaged_run_is_refused(sphere_folder, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "state.pt").write_bytes(b"not a run")
+    with pytest.raises(InputError, match="cannot be resumed"):
+        run(arguments(sphere_folder.parent, tmp_path / "run", "--steps", "1"))
+
+
+def test_checkpointing_keeps_less_and_changes_nothing(trainer):
+    """The same gradients, from fewer bytes kept for the backward pass."""
+    found = []
+    for words in ((), ("--checkpointing",)):
+        t = trainer(*words)
+        t.network.train()
+        rng = np.random.default_rng(0)
+        sample = t.clips.sample(rng, 2, 4)
+        kept = [0]
+
+        def pack(x, kept=kept):
+            kept[0] += x.nbytes
+            return x
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
+            assert t.learn(sample, rng, []) is not None
+        found.append(({k: p.grad for k, p in t.network.named_parameters()}, kept[0]))
+    (plain, more), (checkpointed, less) = found
+    torch.testing.assert_close(checkpointed, plain, rtol=1e-5, atol=1e-7)
+    assert less < more
+
+
+def test_perceptual_loss_joins_where_there_are_weights(trainer, tmp_path, monkeypatch):
+    without = trainer().train_step(np.zeros(4))
+    torch.save(VGG(19).state_dict(), tmp_path / "vgg19.pth")
+    monkeypatch.setenv("TIMESPLAT_WEIGHTS", str(tmp_path))
+    joined = trainer().train_step(np.zeros(4))
+    assert joined[0] > without[0] and joined[1] == without[1]
+    assert trainer("--perceptual", "0").train_step(np.zeros(4)) == without
