@@ -17,8 +17,8 @@ import time
 from functools import partial
 
 import torch
-from rasterize import scene  # benchmarks/rasterize.py
 
+from timesplat.benchmarks.rasterize import scene
 from timesplat.model.rasterize import rasterize
 
 
