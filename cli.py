@@ -79,13 +79,16 @@ def render(args: argparse.Namespace) -> int:
 def train_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("data", nargs="+", type=Path, help="folders of Sequences rendered with passes")
     p.add_argument("--out", type=Path, required=True, help="run folder; training goes on where it stands")
-    p.add_argument("--preset", choices=["tiny", "small", "base", "large"], default="tiny", help="size (default: tiny)")
-    p.add_argument("--head", choices=["paper", "kinematic"], default="kinematic", help="20 or 19 outputs a pixel")
-    p.add_argument("--source", choices=["given", "sweep", "predicted"], default="given", help="where depth comes from")
-    p.add_argument("--depth-range", choices=["paper", "centred"], default="paper", help="for --source predicted")
-    p.add_argument("--time", choices=["free", "aligned"], default="free", help="of a pixel: free, or its frame's")
-    p.add_argument("--free", type=int, default=0, help="free Gaussians beside the pixels' (default: 0)")
-    p.add_argument("--motion", choices=["gaussian", "hexplane"], default="gaussian", help="what moves Gaussians")
+    p.add_argument("--preset", choices=["tiny", "small", "base", "large"], default="tiny", help="network (default: "
+                   "tiny): base and large are the paper's, --head paper --source predicted; tiny and small are --head "
+                   "kinematic --source given; the six options below change what they name of it")  # fmt: skip
+    p.add_argument("--head", choices=["paper", "kinematic"], help="20 or 19 outputs a pixel (default: the preset's)")
+    p.add_argument("--source", choices=["given", "sweep", "predicted"], help="where depth comes from (default: the "
+                   "preset's)")  # fmt: skip
+    p.add_argument("--depth-range", choices=["paper", "centred"], help="for --source predicted (default: paper)")
+    p.add_argument("--time", choices=["free", "aligned"], help="of a pixel: free (default), or its frame's")
+    p.add_argument("--free", type=int, help="free Gaussians beside the pixels' (default: 0)")
+    p.add_argument("--motion", choices=["gaussian", "hexplane"], help="what moves Gaussians (default: gaussian)")
     p.add_argument("--init", type=Path, help="checkpoint to start from, instead of random weights")
     p.add_argument("--steps", type=int, default=100_000, help="stop after this many steps (default: 100000)")
     p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")

@@ -74,11 +74,11 @@ class Config:
         return self.outputs - (self.time == "aligned")
 
 
-PRESETS = {
+PRESETS = {  # large and base are the paper's, small and tiny for a machine of one's own
     "large": Config(width=1024, depth=24, heads=16, head="paper"),
     "base": Config(width=768, depth=12, heads=12, head="paper"),
-    "small": Config(width=384, depth=6, heads=6),
-    "tiny": Config(width=256, depth=4, heads=4),
+    "small": Config(width=384, depth=6, heads=6, source="given"),
+    "tiny": Config(width=256, depth=4, heads=4, source="given"),
 }
 
 

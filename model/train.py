@@ -3,8 +3,8 @@
 
 A RUN folder holds `log.jsonl` (a line per report), `state.pt` (all that an exact resume needs) and
 `network.safetensors` (the averaged weights, ready for `--checkpoint`). Calling it again goes on. The paper's own
-training (section 4.1, appendix) is `--preset large --source predicted --sampling paper --warmup 2000 --bf16
---checkpointing --accumulate N` under torchrun; what differs by default was better at the scale of one machine.
+training (section 4.1, appendix) is `--preset large --sampling paper --warmup 2000 --bf16 --checkpointing
+--accumulate N` under torchrun; what differs by default was better at the scale of one machine.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .deferred import Cut
 from .gaussians import Gaussians4D
 from .lift import lift_geometry
 from .losses import geometric, load_perceptual, photometric
-from .network import PRESETS, Network, load_matching
+from .network import PRESETS, Config, Network, load_matching
 from .optimiser import learning_rate, make_optimisers, take_step
 from .reconstruct import check_device, geometry_for, load_network, save_network
 from .sampling import VIEWS
@@ -58,20 +58,26 @@ def load_clips(args: argparse.Namespace) -> Clips:
     """The clips; one process packs, the others then find them packed."""
     if distributed.rank():
         distributed.wait()
-    passes = args.source == "given" or args.geometric > 0
+    passes = network_config(args).source == "given" or args.geometric > 0
     clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix, passes)
     if not distributed.rank():
         distributed.wait()
     return clips
 
 
+def network_config(args: argparse.Namespace) -> Config:
+    """That of the preset, changed in what options were given. Raises InputError where they do not go together."""
+    options = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
+    return replace(PRESETS[args.preset], **{k: v for k, v in options.items() if v is not None})
+
+
 def make_network(args: argparse.Namespace) -> Network:
     """With random weights by the seed, or those of --init."""
-    chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
-    if args.motion == "hexplane" and args.geometric:
+    config = network_config(args)
+    if config.motion == "hexplane" and args.geometric:
         raise InputError("--geometric compares velocities, and a HexPlane has none; leave it out.")
     torch.manual_seed(args.seed)
-    network = Network(replace(PRESETS[args.preset], **chosen))
+    network = Network(config)
     if args.init:
         load_matching(network, load_network(args.init))
     return network

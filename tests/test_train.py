@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import signal
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +14,13 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model.data import Clips
 from timesplat.model.network import PRESETS, Config, Network
 from timesplat.model.optimiser import learning_rate, make_optimisers, take_step
-from timesplat.model.train import Trainer, run
+from timesplat.model.train import Trainer, make_network, network_config, run
 from timesplat.model.vgg import VGG
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", Config(width=32, depth=1, heads=2))
+    monkeypatch.setitem(PRESETS, "tiny", Config(width=32, depth=1, heads=2, source="given"))
 
 
 def arguments(folder, out, *more) -> argparse.Namespace:
@@ -72,6 +71,28 @@ def load(folder) -> dict:
     return torch.load(folder / "state.pt", weights_only=True)
 
 
+@pytest.mark.parametrize(
+    ("words", "head", "source"),
+    [
+        ("--preset large", "paper", "predicted"),
+        ("--preset base", "paper", "predicted"),
+        ("--preset small", "kinematic", "given"),
+        ("", "kinematic", "given"),
+        ("--preset large --head kinematic --source sweep", "kinematic", "sweep"),
+        ("--source predicted --head paper", "paper", "predicted"),
+    ],
+)
+def test_a_preset_brings_its_network_and_options_change_it(tmp_path, words, head, source):
+    """`large` and `base` alone are the paper's networks."""
+    config = network_config(arguments(tmp_path, tmp_path / "run", *words.split()))
+    assert (config.head, config.source) == (head, source)
+    assert (config.depth_range, config.time, config.free, config.motion) == ("paper", "free", 0, "gaussian")
+    more = ["--depth-range", "centred", "--time", "aligned", "--free", "3"]
+    config = network_config(arguments(tmp_path, tmp_path / "run", *words.split(), *more))
+    assert (config.head, config.source) == (head, source)
+    assert (config.depth_range, config.time, config.free) == ("centred", "aligned", 3)
+
+
 @pytest.mark.parametrize("sampling", ["paper", "static"])
 def test_every_sampling_trains(sphere_folder, tmp_path, sampling):
     args = arguments(sphere_folder.parent, tmp_path / "run", "--sampling", sampling, "--steps", "2", "--head", "paper")
@@ -99,9 +120,7 @@ def trainer(sphere_folder, tmp_path):
 
     def make(*words) -> Trainer:
         args = arguments(sphere_folder.parent, tmp_path / "run", "--source", "predicted", *words)
-        torch.manual_seed(0)
-        config = replace(PRESETS["tiny"], head=args.head, source=args.source)
-        return Trainer(Network(config), Clips(args.data, args.cache), args)
+        return Trainer(make_network(args), Clips(args.data, args.cache), args)
 
     return make
 
