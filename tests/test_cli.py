@@ -84,6 +84,7 @@ def test_methods_and_checkpoints(sphere_folder, tmp_path, capsys):
     )
     refused(capsys, "reconstruct", sphere_folder, "--out", out, "--device", "abacus", says="cannot use this device")
     refused(capsys, "train", sphere_folder, "--out", tmp_path / "run", "--device", "abacus", says="this device")
+    refused(capsys, "train", sphere_folder, "--out", tmp_path / "run", "--rate", "0", says="--rate 0: give")
     refused(capsys, "evaluate", "x.glb", "--out", tmp_path / "e", "--methods", "lift,magic", says="no such method")
     refused(capsys, "train", tmp_path / "none", "--out", tmp_path / "run", says="no Sequence in it", names="none")
     assert not out.exists()

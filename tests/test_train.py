@@ -103,7 +103,10 @@ def test_every_sampling_trains(sphere_folder, tmp_path, sampling):
 
 def test_training_starts_from_static_weights(sphere_folder, tmp_path):
     """As the paper's does from GS-LRM; a network of another kind is refused in one sentence."""
-    folder, more = sphere_folder.parent, ("--source", "predicted", "--steps", "1", "--rate", "0")
+    folder, more = (
+        sphere_folder.parent,
+        ("--source", "predicted", "--steps", "1", "--rate", "1e-300"),
+    )  # too little to change a weight
     run(arguments(folder, tmp_path / "still", *more, "--static"))
     start = tmp_path / "still" / "network.safetensors"
     run(arguments(folder, tmp_path / "moving", *more, "--init", str(start)))
@@ -182,6 +185,46 @@ def test_muon_takes_the_matrices_of_the_blocks():
     assert float(step.square().mean().sqrt()) == pytest.approx(0.2, rel=0.3)
     values = torch.linalg.svdvals(step)
     assert values.max() / values.min() < 4
+
+
+@pytest.mark.parametrize("rate", ["0", "-1e-4", "nan", "inf"])
+def test_a_rate_that_is_none_is_refused_at_once(sphere_folder, tmp_path, rate):
+    with pytest.raises(InputError, match=r"^--rate .*: give a number above 0\.$"):
+        run(arguments(sphere_folder.parent, tmp_path / "run", f"--rate={rate}", "--steps", "1"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_weights_that_run_away_stop_the_run_and_are_not_saved(sphere_folder, tmp_path):
+    folder, out = sphere_folder.parent, tmp_path / "run"
+    with pytest.raises(InputError, match=r"run: .* at step 1 .*lower --rate than 1e\+09\.$"):
+        run(arguments(folder, out, "--rate", "1e9", "--steps", "3"))
+    assert not list(out.iterdir())
+    run(arguments(folder, out, "--steps", "2"))
+    kept = {f.name: f.read_bytes() for f in out.iterdir()}
+    with pytest.raises(InputError, match=r"at step 3 .*lower --rate"):
+        run(arguments(folder, out, "--rate", "1e9", "--steps", "9"))
+    assert {f.name: f.read_bytes() for f in out.iterdir()} == kept
+    run(arguments(folder, out, "--steps", "4"))  # and goes on from there
+    assert load(out)["progress"]["step"] == 4
+    state = load(out)
+    state["network"]["embed.weight"][0, 0] = float("inf")
+    torch.save(state, out / "state.pt")
+    with pytest.raises(InputError, match=r"cannot be resumed .*not finite"):
+        run(arguments(folder, out, "--steps", "9"))
+
+
+@pytest.mark.parametrize(("steps", "stops"), [(500, 102), (30, 30)])
+def test_a_run_that_learns_nothing_any_more_stops(sphere_folder, tmp_path, monkeypatch, steps, stops):
+    """Whether its losses are not finite for long, or to its end; a few of them are borne."""
+    folder, out = sphere_folder.parent, tmp_path / "run"
+    run(arguments(folder, out, "--steps", "2"))
+    kept = (out / "state.pt").read_bytes()
+    monkeypatch.setattr(Trainer, "learn", lambda self, sample, rng, clock: clock.extend([clock[-1]] * 4))
+    with pytest.raises(InputError, match=f"at step {stops} .*lower --rate"):
+        run(arguments(folder, out, "--steps", str(steps)))
+    assert (out / "state.pt").read_bytes() == kept
+    run(arguments(folder, out, "--steps", "9"))
+    assert load(out)["progress"]["step"] == 9
 
 
 def test_damaged_run_is_refused(sphere_folder, tmp_path):
