@@ -77,7 +77,8 @@ def render(args: argparse.Namespace) -> int:
 
 
 def train_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences rendered with passes")
+    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences; rendered with passes for --source given "
+                   "and --geometric")  # fmt: skip
     p.add_argument("--out", type=Path, required=True, help="run folder; training goes on where it stands")
     p.add_argument("--preset", choices=["tiny", "small", "base", "large"], default="tiny", help="network (default: "
                    "tiny): base and large are the paper's, --head paper --source predicted; tiny and small are --head "

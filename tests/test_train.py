@@ -67,6 +67,15 @@ def test_an_interrupted_run_goes_on_exactly(sphere_folder, tmp_path, monkeypatch
         torch.testing.assert_close(parts[kind], whole[kind], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("source", ["sweep", "predicted"])
+def test_pictures_alone_train_what_needs_no_depth(pictures, tmp_path, source):
+    args = arguments(pictures, tmp_path / "run", "--source", source, "--steps", "2")
+    assert run(args) == 0 and load(tmp_path / "run")["progress"]["bad"] == 0
+    args.geometric = 0.3
+    with pytest.raises(InputError, match=r"pictures: .*--geometric.*render it with passes"):
+        run(args)
+
+
 def load(folder) -> dict:
     return torch.load(folder / "state.pt", weights_only=True)
 
