@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import sys
 from pathlib import Path
 
@@ -20,8 +21,27 @@ all of it at once, with pictures and figures:
 """
 
 
+PIPE_CLOSED = 141  # what a shell says of a program that SIGPIPE ended
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command and returns its exit code: 0, or 2 where the input cannot be used."""
+    """Runs a command and returns its exit code: 0, 2 where the input cannot be used, 141 where nobody reads on."""
+    try:
+        try:
+            return _main(argv)
+        finally:
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                stream.flush()
+    except BrokenPipeError:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            try:
+                stream.flush()
+            except BrokenPipeError:  # what is left goes nowhere, so that the interpreter's own flush has no complaint
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return PIPE_CLOSED
+
+
+def _main(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(
         prog="timesplat",
         description="Posed images at any times in, a 4D Gaussian asset out: any view, at any time.",
