@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -21,8 +22,27 @@ all of it at once, with pictures and figures:
 """
 
 
+PIPE_CLOSED = 141  # what a shell says of a program that SIGPIPE ended
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command and returns its exit code: 0, or 2 where the input cannot be used."""
+    """Runs a command and returns its exit code: 0, 2 where the input cannot be used, 141 where nobody reads on."""
+    try:
+        try:
+            return _main(argv)
+        finally:
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                stream.flush()
+    except BrokenPipeError:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            try:
+                stream.flush()
+            except BrokenPipeError:  # what is left goes nowhere, so that the interpreter's own flush has no complaint
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return PIPE_CLOSED
+
+
+def _main(argv: list[str] | None) -> int:
     parser = argparse.ArgumentParser(
         prog="timesplat",
         description="Posed images at any times in, a 4D Gaussian asset out: any view, at any time.",
@@ -79,15 +99,19 @@ def render(args: argparse.Namespace) -> int:
 
 
 def train_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences rendered with passes")
+    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences; rendered with passes for --source given "
+                   "and --geometric")  # fmt: skip
     p.add_argument("--out", type=Path, required=True, help="run folder; training goes on where it stands")
-    p.add_argument("--preset", choices=["tiny", "small", "base", "large"], default="tiny", help="size (default: tiny)")
-    p.add_argument("--head", choices=["paper", "kinematic"], default="kinematic", help="20 or 19 outputs a pixel")
-    p.add_argument("--source", choices=["given", "sweep", "predicted"], default="given", help="where depth comes from")
-    p.add_argument("--depth-range", choices=["paper", "centred"], default="paper", help="for --source predicted")
-    p.add_argument("--time", choices=["free", "aligned"], default="free", help="of a pixel: free, or its frame's")
-    p.add_argument("--free", type=int, default=0, help="free Gaussians beside the pixels' (default: 0)")
-    p.add_argument("--motion", choices=["gaussian", "hexplane"], default="gaussian", help="what moves Gaussians")
+    p.add_argument("--preset", choices=["tiny", "small", "base", "large"], default="tiny", help="network (default: "
+                   "tiny): base and large are the paper's, --head paper --source predicted; tiny and small are --head "
+                   "kinematic --source given; the six options below change what they name of it")  # fmt: skip
+    p.add_argument("--head", choices=["paper", "kinematic"], help="20 or 19 outputs a pixel (default: the preset's)")
+    p.add_argument("--source", choices=["given", "sweep", "predicted"], help="where depth comes from (default: the "
+                   "preset's)")  # fmt: skip
+    p.add_argument("--depth-range", choices=["paper", "centred"], help="for --source predicted (default: paper)")
+    p.add_argument("--time", choices=["free", "aligned"], help="of a pixel: free (default), or its frame's")
+    p.add_argument("--free", type=int, help="free Gaussians beside the pixels' (default: 0)")
+    p.add_argument("--motion", choices=["gaussian", "hexplane"], help="what moves Gaussians (default: gaussian)")
     p.add_argument("--init", type=Path, help="checkpoint to start from, instead of random weights")
     p.add_argument("--steps", type=int, default=100_000, help="stop after this many steps (default: 100000)")
     p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")

@@ -21,6 +21,7 @@ import contextlib
 import math
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -97,7 +98,7 @@ def peak(device: str) -> float:
 
 def row(name: str, views: Views, drop: bool, device: str, roof: float, seconds: float) -> str:
     torch.manual_seed(0)
-    network = Network(PRESETS[name]).to(device).eval()
+    network = Network(replace(PRESETS[name], source="predicted")).to(device).eval()
     views = views.to(device)
     tokens = int(network.kept_patches(views, drop).sum())
     x = torch.randn(tokens, network.config.width, device=device)

@@ -25,9 +25,9 @@ import sys
 import time
 from pathlib import Path
 
-import opensplat
 import torch
 
+from timesplat.benchmarks import opensplat
 from timesplat.evaluation.tables import machine
 from timesplat.model.gaussians import FIELDS, Gaussians4D
 from timesplat.model.io.asset import read_ply

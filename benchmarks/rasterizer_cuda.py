@@ -17,8 +17,8 @@ import time
 from functools import partial
 
 import torch
-from rasterize import scene  # benchmarks/rasterizer.py
 
+from timesplat.benchmarks.rasterizer import scene
 from timesplat.model.rasterize import rasterize
 
 

@@ -90,7 +90,7 @@ def main() -> None:
     for preset in args.presets.split(","):
         for source in args.sources.split(","):
             with TemporaryDirectory() as out:
-                words = [*args.data, "--out", out, "--preset", preset, "--source", source, *more]
+                words = [*args.data, "--out", out, "--preset", preset, "--source", source, "--head", "kinematic", *more]
                 row = measure(train.parse_args(words), args.steps)
             print("|", " | ".join(row), "|", flush=True)
 

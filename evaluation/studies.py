@@ -171,7 +171,7 @@ def training(args, command: str) -> None:
 
 
 def comparisons(folder: Path) -> dict[str, list]:
-    """{run: logs of its stages} below a folder that `benchmarks.compare` filled."""
+    """{run: logs of its stages} below a folder that `evaluation.ablations` filled."""
     order = [r.name for r in RUNS]
     logs = sorted(
         (p for p in folder.glob("*/log.jsonl") if p.parent.name in order), key=lambda p: order.index(p.parent.name)
@@ -337,7 +337,7 @@ EVERY = {"type": int, "default": 4, "metavar": "N", "help": "every N-th frame (d
 RUN = {
     "nargs": "+",
     "metavar": "NAME=RUN",
-    "help": "run folders of `timesplat train`, NAME=A+B for stages; or a folder that benchmarks.compare filled",
+    "help": "run folders of `timesplat train`, NAME=A+B for stages; or a folder that evaluation.ablations filled",
 }
 WINDOW = {"type": int, "default": 5, "help": "reports that the curves are averaged over (default: 5)"}
 SETUP = {"default": "alternating", "help": f"input views: {protocol.FORMS} (default: alternating)"}

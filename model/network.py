@@ -16,6 +16,7 @@ Beyond the paper, and off where its letter is wanted:
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import torch
 import torch.nn.functional as F
@@ -31,19 +32,23 @@ from .views import Views, pluecker, rays
 
 @dataclass(frozen=True)
 class Config:
+    """What a network is. Raises InputError for a word that is none of its field's."""
+
     width: int = 256
     depth: int = 4
     heads: int = 4
     patch: int = 8
-    head: str = "kinematic"  # paper | kinematic
-    source: str = "predicted"  # predicted | sweep | given
-    depth_range: str = "paper"  # paper: 0.1..4.5 | centred: 1.8 to either side of the ray's middle
+    head: Literal["paper", "kinematic"] = "kinematic"
+    source: Literal["predicted", "sweep", "given"] = "predicted"
+    depth_range: Literal["paper", "centred"] = "paper"  # 0.1..4.5, or 1.8 to either side of the ray's middle
     free: int = 0  # free Gaussian tokens
-    time: str = "free"  # of a pixel's Gaussian: free | aligned: its frame's, or where its Geometry has it
-
-    motion: str = "gaussian"  # gaussian | hexplane: 3D Gaussians and a field that moves them (hexplane.py)
+    time: Literal["free", "aligned"] = "free"  # of a pixel's Gaussian; aligned: its frame's, or where its Geometry is
+    motion: Literal["gaussian", "hexplane"] = "gaussian"  # hexplane: a field moves 3D Gaussians (hexplane.py)
 
     def __post_init__(self) -> None:
+        for name, kind in get_type_hints(Config).items():
+            if get_origin(kind) is Literal and (value := getattr(self, name)) not in get_args(kind):
+                raise InputError(f"{name} {value}: no network has that; choose one of {', '.join(get_args(kind))}.")
         if self.motion == "hexplane" and (self.source != "predicted" or self.time == "aligned"):
             raise InputError("hexplane: its Gaussians have no time; it goes with the source predicted and free times.")
 
@@ -69,11 +74,11 @@ class Config:
         return self.outputs - (self.time == "aligned")
 
 
-PRESETS = {
+PRESETS = {  # large and base are the paper's, small and tiny for a machine of one's own
     "large": Config(width=1024, depth=24, heads=16, head="paper"),
     "base": Config(width=768, depth=12, heads=12, head="paper"),
-    "small": Config(width=384, depth=6, heads=6),
-    "tiny": Config(width=256, depth=4, heads=4),
+    "small": Config(width=384, depth=6, heads=6, source="given"),
+    "tiny": Config(width=256, depth=4, heads=4, source="given"),
 }
 
 

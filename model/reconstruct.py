@@ -200,7 +200,8 @@ def load_network(path: Path, device: str = "cpu"):
         network = Network(config)
         network.load_state_dict(tensors, assign=True)
     except Exception as e:
-        raise InputError(f"{path}: not a whole Timesplat checkpoint ({e}); copy or train it again.") from None
+        reason = str(e).rstrip(".")
+        raise InputError(f"{path}: not a whole Timesplat checkpoint ({reason}); copy or train it again.") from None
     bad = [k for k, v in tensors.items() if not torch.isfinite(v).all()]
     if bad:
         raise InputError(f"{path}: the weights {bad[0]} hold NaN or infinity; copy or train it again.")

@@ -148,3 +148,18 @@ def sphere_folder(spheres, write_views, tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "spheres" / "line"
     write_views(spheres(list(range(24)), size=32), folder, held_out)
     return folder
+
+
+@pytest.fixture
+def pictures(sphere_folder, tmp_path):
+    """The same Sequence as `--no-passes` leaves it."""
+    import json
+    import shutil
+
+    folder = tmp_path / "pictures"
+    shutil.copytree(sphere_folder, folder, ignore=shutil.ignore_patterns("passes"))
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:
+        del frame["exr_path"]
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder

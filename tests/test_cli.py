@@ -1,6 +1,7 @@
 """The program as people call it: help that teaches, and one sentence and exit code 2 for what cannot be used."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -8,6 +9,9 @@ import sys
 import pytest
 
 from timesplat.cli import COMMANDS, main
+from timesplat.model.io.asset import write_ply
+
+from .test_asset import make as make_asset
 
 
 def refused(capsys, *argv, says: str, names: str = "") -> None:
@@ -38,6 +42,27 @@ def test_road_from_sequence_to_usd(sphere_folder, tmp_path, capsys):
     assert main(["export", str(ply), str(usd)]) == 0
     said = capsys.readouterr().out
     assert "Gaussians" in said and "coverage" in said and usd.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("errors_too", [False, True])
+@pytest.mark.parametrize(
+    ("words", "how"),
+    [("--help", ""), ("export a.ply b.ply", ""), ("export a.ply b.ply", "1"), ("export a.ply b.obj", "")],
+)
+def test_a_reader_that_leaves_early_is_no_fault(tmp_path, words, how, errors_too):
+    """`timesplat … | head -1`, and with `2>&1`: the code that a shell gives to SIGPIPE, no traceback, whole files."""
+    write_ply(tmp_path / "a.ply", make_asset(3))
+    reader, writer = os.pipe()
+    os.close(reader)
+    code = "import sys\nfrom timesplat.cli import main\nsys.exit(main(sys.argv[1:]))"
+    more = {"stderr": writer if errors_too else subprocess.PIPE, "env": os.environ | {"PYTHONUNBUFFERED": how}}
+    done = subprocess.run([sys.executable, "-c", code, *words.split()], stdout=writer, cwd=tmp_path, **more)
+    os.close(writer)
+    refused = "b.obj" in words
+    assert done.returncode == (2 if refused and not errors_too else 141)
+    if not errors_too:
+        assert (b"b.obj: " in done.stderr and done.stderr.count(b"\n") == 1) if refused else done.stderr == b""
+    assert ((tmp_path / "b.ply").exists()) == ("b.ply" in words)
 
 
 def test_missing_and_damaged_sequences(sphere_folder, tmp_path, capsys):
@@ -84,6 +109,7 @@ def test_methods_and_checkpoints(sphere_folder, tmp_path, capsys):
     )
     refused(capsys, "reconstruct", sphere_folder, "--out", out, "--device", "abacus", says="cannot use this device")
     refused(capsys, "train", sphere_folder, "--out", tmp_path / "run", "--device", "abacus", says="this device")
+    refused(capsys, "train", sphere_folder, "--out", tmp_path / "run", "--rate", "0", says="--rate 0: give")
     refused(capsys, "evaluate", "x.glb", "--out", tmp_path / "e", "--methods", "lift,magic", says="no such method")
     refused(capsys, "train", tmp_path / "none", "--out", tmp_path / "run", says="no Sequence in it", names="none")
     assert not out.exists()

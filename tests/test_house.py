@@ -2,6 +2,7 @@
 """The rules of the house: which room may import which, and what must never come near Blender's process."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ FLOORS = ("datagen", "model", "addon", "evaluation")
 FILES = sorted([*ROOT.glob("*.py"), *(f for floor in FLOORS for f in (ROOT / floor).rglob("*.py"))])
 NAMES = [f.relative_to(ROOT).as_posix() for f in FILES]
 TORCH_FREE = ("datagen/", "addon/", "model/io/")
+BENCHMARKS = sorted(f.stem for f in (ROOT / "benchmarks").glob("*.py") if f.stem != "blender_display")
 TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 
 
@@ -81,6 +83,25 @@ def test_the_face_is_light():
     code += "print([m for m in ('torch', 'bpy', 'pxr', 'numba', 'PIL') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_benchmarks_are_modules_of_the_package(name):
+    try:
+        assert importlib.import_module(f"timesplat.benchmarks.{name}").__doc__
+    except ModuleNotFoundError as e:
+        missing = (e.name or "").split(".")[0]
+        if missing not in {*TENSORS, "matplotlib", "pxr", "bpy", "OpenEXR"}:
+            raise
+        pytest.skip(f"{missing} is not installed")
+
+
+@pytest.mark.parametrize("name", ["gpu", "rasterize"])
+def test_benchmarks_are_scripts_too(name):
+    pytest.importorskip("torch")
+    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 and "--sizes" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if (ROOT / n).read_text().count("\n") > 5])

@@ -41,23 +41,34 @@ class Sample:
     name: str
 
 
-def pack(folder: Path, cache: Path) -> Path:
+def pack(folder: Path, cache: Path, passes: bool = True) -> Path:
     """Sequence folder -> one .safetensors below `cache`, made anew when the Sequence changed. Depth and
-    flow are kept for foreground pixels alone, in half precision."""
+    flow are kept for foreground pixels alone, in half precision. `passes`: whether they are needed; where they are not,
+    a Sequence that lacks them for a view is packed without any, by another name. Raises InputError."""
     folder = Path(folder)
     stamp = (folder / "transforms.json").stat().st_mtime_ns if (folder / "transforms.json").is_file() else 0
     key = hashlib.sha256(f"{VERSION} {folder.resolve()} {stamp}".encode()).hexdigest()[:16]
-    path = Path(cache) / f"{key}.safetensors"
-    if path.exists():
-        return path
+    path, pictures = (Path(cache) / f"{key}{end}.safetensors" for end in ("", "-pictures"))
+    for made in (path,) if passes else (path, pictures):
+        if made.exists():
+            return made
     seq = read_sequence(folder)
+    whole = all(v.passes for v in seq.views)
+    if passes and not whole:
+        raise InputError(
+            f"{folder}: not every view has a depth pass, which --source given and --geometric need; "
+            "render it with passes, or train with --source sweep or predicted alone."
+        )
+    path = path if whole else pictures
     rgba, values, offsets = [], [], [0]
     for i in range(len(seq.views)):
-        passes = seq.load_passes(i)
         image = seq.load_image(i)
-        known = np.isfinite(passes.depth) & (image[..., 3] > 0)
-        depth = np.where(known, passes.depth, 0)[..., None]
-        stack = np.concatenate([depth, passes.flow_next, passes.flow_prev], -1)
+        known, stack = np.zeros(image.shape[:2], bool), np.zeros((*image.shape[:2], 5))
+        if whole:
+            found = seq.load_passes(i)
+            known = np.isfinite(found.depth) & (image[..., 3] > 0)
+            depth = np.where(known, found.depth, 0)[..., None]
+            stack = np.concatenate([depth, found.flow_next, found.flow_prev], -1)
         rgba.append(np.concatenate([image, known[..., None].astype(np.uint8)], -1))
         values.append(stack[known].astype(np.float16))
         offsets.append(offsets[-1] + int(known.sum()))
@@ -140,14 +151,15 @@ class Clips:
     ):
         """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
         than what was rendered. sampling: see sampling.py; mix: see `parse_mix`, groups without clips are left out;
-        passes: whether inputs come with depth and flow. Raises InputError where there is no Sequence, or none that
-        the mix would draw."""
+        passes: whether inputs come with depth and flow. Raises InputError where there is no Sequence, none that the
+        mix would draw, or one without the passes that are needed."""
         self.shrink, self.sampling, self.passes = shrink, sampling, passes
         weights = parse_mix(mix)
         found = [p for f in folders for p in sequences_in(f)]
         if not found:
             raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
-        self.paths = [pack(f, cache) for f in tqdm(found, desc="packing", unit="clip", leave=False, disable=None)]
+        bar = tqdm(found, desc="packing", unit="clip", leave=False, disable=None)
+        self.paths = [pack(f, cache, passes) for f in bar]
         self.groups: dict[str, list[Path]] = {}
         for path in self.paths:
             with safe_open(path, "pt") as f:

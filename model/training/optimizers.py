@@ -12,6 +12,7 @@ from ...datagen.sequence import InputError
 
 KINDS = ("adamw", "muon")
 CLIP = 1.0  # gradient norm; steps beyond 20 times that are skipped
+LARGEST = torch.finfo(torch.float16).max  # weight: checkpoints hold half precision
 DECAY = 0.05  # weight decay of matrices; vectors (norms) have none
 
 
@@ -52,3 +53,10 @@ def take_step(optimisers: list[torch.optim.Optimizer], rate: float, warm: bool) 
             optimiser.step()
         optimiser.zero_grad(set_to_none=True)
     return sound
+
+
+@torch.no_grad()
+def sound_weights(network: nn.Module) -> bool:
+    """Whether all weights are finite, also once they are in a checkpoint."""
+    greatest = torch.stack([torch.linalg.vector_norm(p, math.inf) for p in network.parameters()]).max()
+    return float(greatest) <= LARGEST  # not if any is NaN

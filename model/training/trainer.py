@@ -3,8 +3,8 @@
 
 A RUN folder holds `log.jsonl` (a line per report), `state.pt` (all that an exact resume needs) and
 `network.safetensors` (the averaged weights, ready for `--checkpoint`). Calling it again goes on. The paper's own
-training (section 4.1, appendix) is `--preset large --source predicted --sampling paper --warmup 2000 --bf16
---checkpointing --accumulate N` under torchrun; what differs by default was better at the scale of one machine.
+training (section 4.1, appendix) is `--preset large --sampling paper --warmup 2000 --bf16 --checkpointing
+--accumulate N` under torchrun; what differs by default was better at the scale of one machine.
 """
 
 from __future__ import annotations
@@ -26,22 +26,26 @@ from tqdm import tqdm
 from ...datagen.sequence import InputError
 from ..gaussians import Gaussians4D
 from ..geometry.lift import lift_geometry
-from ..network import PRESETS, Network, load_matching
+from ..network import PRESETS, Config, Network, load_matching
 from ..reconstruct import check_device, geometry_for, load_network, save_network
 from ..views import Views
 from . import distributed
 from .dataset import Clips, Sample
 from .deferred import Cut
 from .losses import geometric, load_perceptual, photometric
-from .optimizers import learning_rate, make_optimisers, take_step
+from .optimizers import learning_rate, make_optimisers, sound_weights, take_step
 from .view_sampling import VIEWS
 
 EMA = 0.998  # per step; the shipped weights are this average
+REPORT = 20  # steps between two lines of the log
+PATIENCE = 100  # steps in a row that may change nothing
 STAGES = ("data", "geometry", "network", "raster")  # what a step's time is spent on
 
 
 def run(args: argparse.Namespace) -> int:
     """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
+    if not 0 < args.rate < math.inf:
+        raise InputError(f"--rate {args.rate:g}: give a number above 0.")
     check_device(args.device)
     args.device = distributed.start(args.device)
     try:
@@ -58,20 +62,26 @@ def load_clips(args: argparse.Namespace) -> Clips:
     """The clips; one process packs, the others then find them packed."""
     if distributed.rank():
         distributed.wait()
-    passes = args.source == "given" or args.geometric > 0
+    passes = network_config(args).source == "given" or args.geometric > 0
     clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix, passes)
     if not distributed.rank():
         distributed.wait()
     return clips
 
 
+def network_config(args: argparse.Namespace) -> Config:
+    """That of the preset, changed in what options were given. Raises InputError where they do not go together."""
+    options = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
+    return replace(PRESETS[args.preset], **{k: v for k, v in options.items() if v is not None})
+
+
 def make_network(args: argparse.Namespace) -> Network:
     """With random weights by the seed, or those of --init."""
-    chosen = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
-    if args.motion == "hexplane" and args.geometric:
+    config = network_config(args)
+    if config.motion == "hexplane" and args.geometric:
         raise InputError("--geometric compares velocities, and a HexPlane has none; leave it out.")
     torch.manual_seed(args.seed)
-    network = Network(replace(PRESETS[args.preset], **chosen))
+    network = Network(config)
     if args.init:
         load_matching(network, load_network(args.init))
     return network
@@ -93,6 +103,7 @@ class Trainer:
         self.optimisers = make_optimisers(network, args.optimiser)
         self.step, self.seconds, self.cpu = 0, 0.0, 0.0
         self.skipped, self.bad = 0, 0  # steps whose gradient was not sound; samples whose loss was not finite
+        self.learnt, self.idle = False, 0  # whether the last step changed anything; those in a row that did not
         self.stopped = False
         self.state = args.out / "state.pt"
         args.out.mkdir(parents=True, exist_ok=True)
@@ -106,7 +117,8 @@ class Trainer:
         return self.step / self.args.steps
 
     def run(self) -> None:
-        """Trains to the end; an interrupt (Ctrl-C) ends it after the step at hand, with the state saved."""
+        """Trains to the end; an interrupt (Ctrl-C) ends it after the step at hand, with the state saved. Raises
+        InputError where weights, or losses for long, are not finite: the state is the last good one then."""
         previous = signal.signal(signal.SIGINT, lambda *_: setattr(self, "stopped", True))
         try:
             self._loop()
@@ -118,22 +130,40 @@ class Trainer:
     def _loop(self) -> None:
         args, wall, cpu = self.args, self.seconds - time.perf_counter(), self.cpu - time.process_time()
         layout = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
-        bar = tqdm(total=1.0, disable=None if not distributed.rank() else True, bar_format=layout, desc=args.out.name)
+        quiet = True if distributed.rank() else None
         recent: list[tuple[float, float]] = []
-        shares = np.zeros(len(STAGES))
-        while self.progress() < 1 and not self.stopped:
-            recent.append(self.train_step(shares))
-            seconds, stopped = distributed.greatest([wall + time.perf_counter(), self.stopped], args.device)
-            self.seconds, self.stopped, self.cpu = seconds, bool(stopped), cpu + time.process_time()
-            if self.step % 20 == 0:
-                line = self.report(recent, shares)
-                bar.set_postfix_str(" {step} loss {loss:.4f} psnr {psnr:.2f} {samples_per_s} samples/s".format(**line))
-                recent, shares = [], np.zeros(len(STAGES))
-            bar.update(self.progress() - bar.n)
-            if self.step % 200 == 0:
+        shares, due = np.zeros(len(STAGES)), False
+        with tqdm(total=1.0, disable=quiet, bar_format=layout, desc=args.out.name) as bar:
+            while self.progress() < 1 and not self.stopped:
+                recent.append(self.train_step(shares))
+                told = [wall + time.perf_counter(), self.stopped, self.learnt]
+                seconds, stopped, learnt = distributed.greatest(told, args.device)
+                self.seconds, self.stopped, self.cpu = seconds, bool(stopped), cpu + time.process_time()
+                self.idle = 0 if learnt else self.idle + 1
+                if self.step % REPORT == 0:
+                    line = self.report(recent, shares)
+                    text = " {step} loss {loss:.4f} psnr {psnr:.2f} {samples_per_s} samples/s"
+                    bar.set_postfix_str(text.format(**line))
+                    recent, shares = [], np.zeros(len(STAGES))
+                bar.update(self.progress() - bar.n)
+                if self.idle >= PATIENCE:
+                    raise self.ran_away(f"{self.idle} steps without a sound loss and gradient")
+                due |= self.step % 200 == 0
+                if due and not self.idle:
+                    self.save()
+                    due = False
+            if self.idle < REPORT:
                 self.save()
-        self.save()
-        bar.close()
+            elif not self.stopped:
+                raise self.ran_away(f"its last {self.idle} steps were without a sound loss and gradient")
+
+    def ran_away(self, how: str) -> InputError:
+        """What ends a run that is past help; nothing was saved since it was not."""
+        kept = "; it goes on from its last good state" if self.state.exists() else ""
+        return InputError(
+            f"{self.args.out}: training ran away at step {self.step} ({how}){kept}; "
+            f"give a lower --rate than {self.args.rate:g}."
+        )
 
     def report(self, recent: list[tuple[float, float]], shares: np.ndarray) -> dict:
         """A line of the log: means since the last one; seconds by the clock and of processor time (under load only
@@ -169,13 +199,17 @@ class Trainer:
             shares += [data, geometry, forward + backward, raster]
         distributed.average_gradients(self.network)
         rate = learning_rate(args.rate, self.step, args.warmup, self.progress())
-        self.skipped += not take_step(self.optimisers, rate, warm=self.step >= args.warmup)
+        stepped = take_step(self.optimisers, rate, warm=self.step >= args.warmup)
+        self.skipped += not stepped
         self.step += 1
+        if not sound_weights(self.network):
+            raise self.ran_away("weights beyond what a checkpoint holds")
         decay = min(EMA, self.step / (self.step + 10))
         for k, v in self.network.state_dict().items():
             self.average[k].lerp_(v, 1 - decay)
         good = [r for r in results if r is not None]
         self.bad += len(results) - len(good)
+        self.learnt = stepped and bool(good)
         return tuple(np.mean(good or [(np.nan, np.nan)], axis=0).tolist())
 
     def learn(self, sample: Sample, rng: np.random.Generator, clock: list[float]) -> tuple[float, float] | None:
@@ -266,6 +300,8 @@ class Trainer:
         try:
             state = torch.load(self.state, map_location=self.args.device, weights_only=True)
             self.network.load_state_dict(state["network"])
+            if not sound_weights(self.network):
+                raise ValueError("its weights are not finite")
             self.average = state["average"]
             for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
                 optimiser.load_state_dict(saved)

@@ -1,8 +1,12 @@
 """The transformer: sizes by hand, the appendix's activations, token dropping, and starting as the geometry."""
 
+import argparse
+import typing
+
 import pytest
 import torch
 
+from timesplat.cli import train_arguments
 from timesplat.datagen.sequence import InputError
 from timesplat.model.gaussians import FIELDS
 from timesplat.model.geometry.lift import lift_geometry
@@ -27,6 +31,17 @@ def test_parameter_counts_by_hand(name, width, depth, near):
     hand = depth * block + 64 * 10 * width + width * 64 * 20 + 2 * width
     assert count == hand
     assert abs(depth * block / near - 1) < 0.01
+
+
+@pytest.mark.parametrize("name", ["head", "source", "depth_range", "time", "motion"])
+def test_a_word_that_no_network_knows_is_refused(name):
+    """Not taken for one of the others; and the command line offers the words that the network knows."""
+    with pytest.raises(InputError, match=rf"^{name} papr: .*choose one of \w+, \w+.*\.$"):
+        Config(**{name: "papr"})
+    parser = argparse.ArgumentParser()
+    train_arguments(parser)
+    (action,) = (a for a in parser._actions if a.dest == name)
+    assert set(action.choices) == set(typing.get_args(typing.get_type_hints(Config)[name]))
 
 
 def test_untrained_paper_head_starts_at_the_appendix_biases(views):

@@ -52,6 +52,10 @@ def test_checkpoint_with_nan_or_another_shape_or_no_config(checkpoint, tmp_path)
     save_file(tensors, tmp_path / "bare.safetensors")
     with pytest.raises(InputError, match="not a whole Timesplat checkpoint"):
         load_network(tmp_path / "bare.safetensors")
+    meta = {"config": json.dumps({"width": 32, "depth": 1, "heads": 2, "source": "given", "head": "kinematik"})}
+    save_file(tensors, tmp_path / "typo.safetensors", meta)
+    with pytest.raises(InputError, match=r"typo\.saf.*: not a whole Timesplat .*\(head kinematik: .*kinematic\); copy"):
+        load_network(tmp_path / "typo.safetensors")
     with pytest.raises(InputError, match="no such checkpoint"):
         load_network(tmp_path / "none.safetensors")
 

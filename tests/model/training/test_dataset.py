@@ -42,6 +42,20 @@ def test_packed_views_are_the_rendered_ones(sphere_folder, tmp_path):
         Clips([tmp_path / "nothing"], tmp_path)
 
 
+def test_pictures_alone_are_packed_where_there_are_no_passes(sphere_folder, pictures, tmp_path):
+    with pytest.raises(InputError, match=r"pictures: .*depth.*render it with passes, or .*--source sweep or predicted"):
+        Clips([pictures], tmp_path)
+    assert not list(tmp_path.glob("*.safetensors"))
+    clips = Clips([pictures, sphere_folder], tmp_path, passes=False)
+    inputs = [clips.sample(np.random.default_rng(seed), 2).inputs for seed in range(9)]
+    assert all(x.depth is None and x.flow is None and x.alpha.any() for x in inputs)
+    whole = Clips([sphere_folder], tmp_path / "whole", passes=True)
+    assert whole.paths[0].name == clips.paths[1].name  # what has passes is packed with them in any case
+    with pytest.raises(InputError, match="pictures: "):  # also once it is packed without
+        Clips([pictures], tmp_path)
+    assert Clips([pictures], tmp_path, passes=False).paths == clips.paths[:1]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_inputs_are_one_view_a_frame_or_two_at_even_ones(seed):
     frame, camera = np.repeat(np.arange(24), 6), np.tile(np.arange(6), 24)

@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import signal
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +14,13 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model.network import PRESETS, Config, Network
 from timesplat.model.training.dataset import Clips
 from timesplat.model.training.optimizers import learning_rate, make_optimisers, take_step
-from timesplat.model.training.trainer import Trainer, run
+from timesplat.model.training.trainer import Trainer, make_network, network_config, run
 from timesplat.model.training.vgg import VGG
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", Config(width=32, depth=1, heads=2))
+    monkeypatch.setitem(PRESETS, "tiny", Config(width=32, depth=1, heads=2, source="given"))
 
 
 def arguments(folder, out, *more) -> argparse.Namespace:
@@ -68,8 +67,39 @@ def test_an_interrupted_run_goes_on_exactly(sphere_folder, tmp_path, monkeypatch
         torch.testing.assert_close(parts[kind], whole[kind], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("source", ["sweep", "predicted"])
+def test_pictures_alone_train_what_needs_no_depth(pictures, tmp_path, source):
+    args = arguments(pictures, tmp_path / "run", "--source", source, "--steps", "2")
+    assert run(args) == 0 and load(tmp_path / "run")["progress"]["bad"] == 0
+    args.geometric = 0.3
+    with pytest.raises(InputError, match=r"pictures: .*--geometric.*render it with passes"):
+        run(args)
+
+
 def load(folder) -> dict:
     return torch.load(folder / "state.pt", weights_only=True)
+
+
+@pytest.mark.parametrize(
+    ("words", "head", "source"),
+    [
+        ("--preset large", "paper", "predicted"),
+        ("--preset base", "paper", "predicted"),
+        ("--preset small", "kinematic", "given"),
+        ("", "kinematic", "given"),
+        ("--preset large --head kinematic --source sweep", "kinematic", "sweep"),
+        ("--source predicted --head paper", "paper", "predicted"),
+    ],
+)
+def test_a_preset_brings_its_network_and_options_change_it(tmp_path, words, head, source):
+    """`large` and `base` alone are the paper's networks."""
+    config = network_config(arguments(tmp_path, tmp_path / "run", *words.split()))
+    assert (config.head, config.source) == (head, source)
+    assert (config.depth_range, config.time, config.free, config.motion) == ("paper", "free", 0, "gaussian")
+    more = ["--depth-range", "centred", "--time", "aligned", "--free", "3"]
+    config = network_config(arguments(tmp_path, tmp_path / "run", *words.split(), *more))
+    assert (config.head, config.source) == (head, source)
+    assert (config.depth_range, config.time, config.free) == ("centred", "aligned", 3)
 
 
 @pytest.mark.parametrize("sampling", ["paper", "static"])
@@ -82,7 +112,10 @@ def test_every_sampling_trains(sphere_folder, tmp_path, sampling):
 
 def test_training_starts_from_static_weights(sphere_folder, tmp_path):
     """As the paper's does from GS-LRM; a network of another kind is refused in one sentence."""
-    folder, more = sphere_folder.parent, ("--source", "predicted", "--steps", "1", "--rate", "0")
+    folder, more = (
+        sphere_folder.parent,
+        ("--source", "predicted", "--steps", "1", "--rate", "1e-300"),
+    )  # too little to change a weight
     run(arguments(folder, tmp_path / "still", *more, "--static"))
     start = tmp_path / "still" / "network.safetensors"
     run(arguments(folder, tmp_path / "moving", *more, "--init", str(start)))
@@ -99,9 +132,7 @@ def trainer(sphere_folder, tmp_path):
 
     def make(*words) -> Trainer:
         args = arguments(sphere_folder.parent, tmp_path / "run", "--source", "predicted", *words)
-        torch.manual_seed(0)
-        config = replace(PRESETS["tiny"], head=args.head, source=args.source)
-        return Trainer(Network(config), Clips(args.data, args.cache), args)
+        return Trainer(make_network(args), Clips(args.data, args.cache), args)
 
     return make
 
@@ -163,6 +194,46 @@ def test_muon_takes_the_matrices_of_the_blocks():
     assert float(step.square().mean().sqrt()) == pytest.approx(0.2, rel=0.3)
     values = torch.linalg.svdvals(step)
     assert values.max() / values.min() < 4
+
+
+@pytest.mark.parametrize("rate", ["0", "-1e-4", "nan", "inf"])
+def test_a_rate_that_is_none_is_refused_at_once(sphere_folder, tmp_path, rate):
+    with pytest.raises(InputError, match=r"^--rate .*: give a number above 0\.$"):
+        run(arguments(sphere_folder.parent, tmp_path / "run", f"--rate={rate}", "--steps", "1"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_weights_that_run_away_stop_the_run_and_are_not_saved(sphere_folder, tmp_path):
+    folder, out = sphere_folder.parent, tmp_path / "run"
+    with pytest.raises(InputError, match=r"run: .* at step 1 .*lower --rate than 1e\+09\.$"):
+        run(arguments(folder, out, "--rate", "1e9", "--steps", "3"))
+    assert not list(out.iterdir())
+    run(arguments(folder, out, "--steps", "2"))
+    kept = {f.name: f.read_bytes() for f in out.iterdir()}
+    with pytest.raises(InputError, match=r"at step 3 .*lower --rate"):
+        run(arguments(folder, out, "--rate", "1e9", "--steps", "9"))
+    assert {f.name: f.read_bytes() for f in out.iterdir()} == kept
+    run(arguments(folder, out, "--steps", "4"))  # and goes on from there
+    assert load(out)["progress"]["step"] == 4
+    state = load(out)
+    state["network"]["embed.weight"][0, 0] = float("inf")
+    torch.save(state, out / "state.pt")
+    with pytest.raises(InputError, match=r"cannot be resumed .*not finite"):
+        run(arguments(folder, out, "--steps", "9"))
+
+
+@pytest.mark.parametrize(("steps", "stops"), [(500, 102), (30, 30)])
+def test_a_run_that_learns_nothing_any_more_stops(sphere_folder, tmp_path, monkeypatch, steps, stops):
+    """Whether its losses are not finite for long, or to its end; a few of them are borne."""
+    folder, out = sphere_folder.parent, tmp_path / "run"
+    run(arguments(folder, out, "--steps", "2"))
+    kept = (out / "state.pt").read_bytes()
+    monkeypatch.setattr(Trainer, "learn", lambda self, sample, rng, clock: clock.extend([clock[-1]] * 4))
+    with pytest.raises(InputError, match=f"at step {stops} .*lower --rate"):
+        run(arguments(folder, out, "--steps", str(steps)))
+    assert (out / "state.pt").read_bytes() == kept
+    run(arguments(folder, out, "--steps", "9"))
+    assert load(out)["progress"]["step"] == 9
 
 
 def test_damaged_run_is_refused(sphere_folder, tmp_path):
