@@ -11,7 +11,7 @@ import pytest
 from timesplat.cli import COMMANDS, main
 from timesplat.model.io.asset import write_ply
 
-from .test_asset import make as make_asset
+from .model.io.test_asset import make as make_asset
 
 
 def refused(capsys, *argv, says: str, names: str = "") -> None:
