@@ -8,6 +8,7 @@ import io
 import os
 import shlex
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 from . import __version__
@@ -50,18 +51,19 @@ def _main(argv: list[str] | None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"timesplat {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
-    for name, (arguments, command, text) in COMMANDS.items():
-        sub = commands.add_parser(name, help=text, description=(command.__doc__ or text))
-        arguments(sub)
-        sub.set_defaults(run=command)
+    commands = parser.add_subparsers(dest="name", required=True, metavar="command")
     if argv is None:
         argv = sys.argv[1:]
+    for name, (arguments, command, text) in COMMANDS.items():
+        sub = commands.add_parser(name, help=text, description=(command.__doc__ or text))
+        if name in argv:  # the others' arguments would only cost time
+            arguments(sub)
+        sub.set_defaults(run=command)
     for stream in (sys.stdout, sys.stderr):  # a console may lack letters of a file's name
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     args = parser.parse_args(argv)
-    args.typed = shlex.join(["timesplat", *map(str, argv)])  # for tables, which say by which command they were made
+    args.command = shlex.join(["timesplat", *map(str, argv)])  # for tables, which say by which command they were made
     try:
         return args.run(args) or 0
     except InputError as e:
@@ -278,157 +280,54 @@ def save_blend(asset: Path, out: Path) -> None:
         raise InputError(f"{out}: the .blend was not written: {reason}")
 
 
-# ---------------------------------------------------------------- evaluate, demo
+# ---------------------------------------------------------------- evaluate, bench, demo
 
 
 def evaluate_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("assets", nargs="+", help="animated files, zoo:SEED, rendered Sequences, or folders of either")
-    p.add_argument("--setup", default="alternating", help="comma-separated: alternating, interpolation, rotating, "
-                   "random (all: these four), video, canonical, random-N, views-N (default: alternating)")  # fmt: skip
-    p.add_argument("--size", default="128", help="comma-separated pixels, multiples of 8 (default: 128); rendered "
-                   "at the largest, the others are whole fractions of it")  # fmt: skip
-    p.add_argument("--protocol", choices=["paper"], help="score four canonical and a random view a frame also for one "
-                   "setup and size, not the held-out views alone")  # fmt: skip
-    p.add_argument("--stride", default="1", help="score every Nth frame; one number, or one for each size (default: 1)")
-    p.add_argument("--samples", type=int, default=16, help="Cycles samples (default: 16)")
-    p.add_argument("--methods", default="white,hull,lift,guided,sweep,predicted,rgb", help="comma-separated")
-    p.add_argument("--checkpoint", type=Path, help="weights for the one network method named")
-    p.add_argument("--out", type=Path, required=True, help="folder for renders, metrics.json, tables.md, tables.csv")
-    p.add_argument("--jobs", type=int, default=2, help="processes, one core each (default: 2)")
-    p.add_argument("--seconds", type=float, default=10.0, help="for methods that fit a scene (default: 10)")
-    p.add_argument("--limit", type=float, help="seconds after which no reconstruction is started; then the tables "
-                   "are those of what there is, and the same command goes on")  # fmt: skip
-    p.add_argument("--no-lpips", dest="lpips", action="store_false", help="leave LPIPS out even if it has weights")
-    p.add_argument("--seed", type=int, default=0)
+    from .evaluation.evaluate import add_arguments
+
+    add_arguments(p)
 
 
 def evaluate(args: argparse.Namespace) -> int:
     """Render what is not yet rendered, reconstruct with each method, score, write tables in the paper's layout."""
-    import time
+    from .evaluation.evaluate import EvaluateOptions, evaluate
 
-    from .datagen.render import Settings
-    from .datagen.rigs import SETUPS
-    from .evaluation.evaluate import evaluate_folders, find_sequences
-    from .evaluation.lpips import HINT, LPIPS
-    from .evaluation.protocol import TABLE, check_setup
-
-    methods, sizes, stride = check_methods(args.methods), numbers("--size", args.size), numbers("--stride", args.stride)
-    names = ",".join(TABLE) if args.setup == "all" else args.setup
-    setups = list(dict.fromkeys(check_setup(s.strip()) for s in names.split(",")))
-    if len(stride) not in (1, len(sizes)):
-        raise InputError(f"--stride {args.stride}: give one number, or one for each of the {len(sizes)} sizes.")
-    if args.seconds <= 0:
-        raise InputError(f"--seconds {args.seconds:g}: give more than 0.")
-    if args.jobs < 1:
-        raise InputError(f"--jobs {args.jobs}: give 1 or more.")
-    several = len(setups) > 1 or len(sizes) > 1 or args.protocol == "paper"
-    rig = "evaluation" if several or setups[0] not in SETUPS else setups[0]
-    settings = Settings(rig=rig, targets=1, size=max(sizes), samples=args.samples, seed=args.seed)
-
-    sequences, others = find_sequences(args.assets)
-    rendered = bool(sequences)
-    failures = render_into(args.out / "renders" / rig, others, settings, args.jobs, sequences)
-    if not sequences:
-        raise InputError(f"{args.assets[0]}: nothing to evaluate; none of the assets could be rendered.")
-    if args.lpips and not LPIPS.find():
-        print(HINT, file=sys.stderr)
-    evaluate_folders(
-        sequences,
-        methods,
-        args.out,
-        args.checkpoint,
-        command=args.typed,
-        setups=tuple(setups),
-        sizes=tuple(sorted(sizes)),
-        stride=tuple(n for _, n in sorted(zip(sizes, stride * len(sizes), strict=False))),
-        lpips=args.lpips,
-        seconds=args.seconds,
-        deadline=time.time() + args.limit if args.limit is not None else float("inf"),
-        jobs=min(args.jobs, len(setups) * len(sequences)) if several or rendered else 1,
-    )
-    return 2 if failures else 0
-
-
-def render_into(folder: Path, assets: list[str], settings, jobs: int, sequences: dict) -> list[str]:
-    """Renders what is not yet rendered, adds it to `sequences` by name, returns what failed."""
-    from tqdm import tqdm
-
-    from .datagen.render import render_assets
-    from .datagen.sequence import read_sequence
-
-    if not assets:
-        return []
-    with tqdm(total=0, desc="rendering", unit="object", disable=None) as bar:
-
-        def progress(done: int, total: int, images: int) -> None:
-            bar.total, bar.n = total, done
-            bar.refresh()
-
-        made, failures = render_assets(assets, folder, settings, jobs=jobs, report=bar.write, progress=progress)
-    sequences |= {f.parent.name: read_sequence(f) for f in sorted(made)}
-    return failures
-
-
-def numbers(option: str, text: str) -> list[int]:
-    """Comma-separated whole numbers above 0. Raises InputError."""
-    parts = [p.strip() for p in text.split(",")]
-    if not all(p.isdigit() and int(p) > 0 for p in parts):
-        raise InputError(f"{option} {text}: give numbers above 0, with commas between them.")
-    return [int(p) for p in parts]
-
-
-def check_methods(text: str) -> list[str]:
-    """A comma-separated list of methods. Raises InputError naming the unknown one and those there are."""
-    from .evaluation.evaluate import parse_method
-
-    methods = [m.strip() for m in text.split(",") if m.strip()]
-    for m in methods:
-        parse_method(m)
-    return methods
+    return evaluate(options_of(EvaluateOptions, args))
 
 
 def bench_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("assets", nargs="*", help="animated files, zoo:SEED, Sequences rendered with --rig evaluation "
-                   "--targets 1, or folders of either (default: 6 procedural objects no checkpoint saw)")  # fmt: skip
-    p.add_argument("--out", type=Path, default=Path("out/bench"), help="folder to write (default: out/bench); "
-                   "another one after changing the code, as rows are kept")  # fmt: skip
-    p.add_argument("--objects", type=int, help="only the first N objects")
-    p.add_argument("--quick", action="store_true", help="2 objects unless --objects says, no fit of more than 3 "
-                   "seconds, no chart of the renderer: some 4 minutes")  # fmt: skip
-    p.add_argument("--methods", help="only these ways, at the centre: comma-separated, written as in bench.csv, for "
-                   "example guided,4dgs:10,rgb+refine:3")  # fmt: skip
-    p.add_argument("--renderer", action="store_true", help="only the chart of the renderer: some 2 minutes")
-    p.add_argument("--size", type=int, default=128, help="pixels to render at; 256 adds that size (default: 128)")
-    p.add_argument("--jobs", type=int, default=2, help="processes, one core each (default: 2)")
-    p.add_argument("--limit", type=float, help="seconds after which nothing is started; the charts are then of what "
-                   "all objects have, and the same command goes on")  # fmt: skip
-    p.add_argument("--draw", type=Path, metavar="CSV", help="only draw again, from a bench.csv")
+    from .evaluation.bench import add_arguments
+
+    add_arguments(p)
 
 
 def bench(args: argparse.Namespace) -> int:
     """Speed against accuracy: every way from posed images to novel views, on held-out objects, in some 25 minutes
-    on two cores. Writes into --out: bench.csv (a row for each object and way), bench.md (means, machine, what is
+    on two cores. Writes into --out: bench.csv (a row for each object and method), bench.md (means, machine, what is
     on the Pareto frontiers) and bench-*.png and .svg: quality against seconds and against size, Gaussian budgets,
     numbers of views and sizes, renderer samples. A run that was stopped goes on where it was."""
-    from .evaluation.bench_command import run
+    from .evaluation.bench import BenchOptions, bench
 
-    return run(args, render_into)
+    return bench(options_of(BenchOptions, args))
 
 
 def demo_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
-        "asset", nargs="?", help="an animated file, or zoo:SEED (default: a procedural object no checkpoint saw)"
-    )
-    p.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write (default: out/demo)")
-    p.add_argument("--size", type=int, default=128, help="pixels, a multiple of 8 (default: 128)")
-    p.add_argument("--samples", type=int, default=32, help="Cycles samples (default: 32)")
+    from .evaluation.demo import add_arguments
+
+    add_arguments(p)
 
 
 def demo(args: argparse.Namespace) -> int:
     """Render an animated object, reconstruct it several ways, export it, and lay everything side by side."""
-    from .evaluation.demo import run
+    from .evaluation.demo import DemoOptions, demo
 
-    return run(args, save_blend)
+    return demo(options_of(DemoOptions, args), save_blend)
+
+
+def options_of(kind: type, args: argparse.Namespace):
+    """The dataclass `kind` filled from the arguments of its fields' names."""
+    return kind(**{f.name: getattr(args, f.name) for f in fields(kind) if hasattr(args, f.name)})
 
 
 def extension_arguments(p: argparse.ArgumentParser) -> None:

@@ -28,8 +28,8 @@ import torch
 from torch import nn
 
 from timesplat.datagen.sequence import read_sequence, sequences_in
-from timesplat.evaluation.evaluate import draw
-from timesplat.evaluation.metrics import psnr
+from timesplat.evaluation.image_quality import psnr
+from timesplat.evaluation.scoring import draw
 from timesplat.model.network import PRESETS, Network
 from timesplat.model.reconstruct import CHECKPOINTS, geometry_for, load_network
 from timesplat.model.views import Views, load_views

@@ -28,7 +28,7 @@ from pathlib import Path
 import torch
 
 from timesplat.benchmarks import opensplat
-from timesplat.evaluation.tables import machine
+from timesplat.evaluation.provenance import machine
 from timesplat.model.gaussians import FIELDS, Gaussians4D
 from timesplat.model.io.asset import read_ply
 from timesplat.model.rasterize import render

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from timesplat.evaluation.tables import machine
+from timesplat.evaluation.provenance import machine
 from timesplat.model.io.asset import ARRAYS, Asset, read_ply
 from timesplat.model.io.usd_write import MODES, check_usd, read_usd, write_usd
 

@@ -23,8 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datagen.sequence import InputError
-from .figures import command_line, replace, write_table
+from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from . import protocol, runner
+from .cache import Cache, name_sequences
+from .figures import command_line, write_table, write_whole
+from .method_spec import parse_spec
+from .metrics import METRICS
+from .provenance import Provenance
 
 BASE = {
     "--shrink": 2,
@@ -76,9 +81,23 @@ RUNS = [
 ]
 
 
+@dataclass(frozen=True)
+class AblationOptions:
+    """What the command is asked for; see `main`."""
+
+    out: Path = Path("out/ablations")
+    data: Path = Path("data")
+    dev: Path | None = None
+    only: str | None = None
+    steps: int = 400
+    core: int | None = None
+    objects: int | None = None
+    table: bool = False
+
+
 def main(argv: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--out", type=Path, default=Path("out/compare"), help="run folders and the table")
+    p.add_argument("--out", type=Path, default=Path("out/ablations"), help="run folders and the table")
     p.add_argument("--data", type=Path, default=Path("data"), help="folder with train/, zoo/ and dev/ (default: data)")
     p.add_argument("--dev", type=Path, help="held-out Sequences with a rig `target` (default: DATA/dev)")
     p.add_argument("--only", help=f"comma-separated, of: {', '.join(r.name for r in RUNS)}")
@@ -86,41 +105,42 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--core", type=int, help="pin everything to this core")
     p.add_argument("--objects", type=int, help="score on so many held-out objects (default: all)")
     p.add_argument("--table", action="store_true", help="write the table of what is finished, train nothing")
-    args = p.parse_args(argv)
+    options = AblationOptions(**vars(p.parse_args(argv)))
     try:
-        return run(args, command_line("timesplat.evaluation.ablations", argv))
+        return run(options, command_line("timesplat.evaluation.ablations", argv))
     except InputError as e:
-        print(f"compare: {e}", file=sys.stderr)
+        print(f"ablations: {e}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("compare: stopped; the same command goes on.", file=sys.stderr)
+        print("ablations: stopped; the same command goes on.", file=sys.stderr)
         return 130
 
 
-def run(args: argparse.Namespace, command: str) -> int:
-    runs = chosen(args.only)
+def run(options: AblationOptions, command: str) -> int:
+    """Trains what is not yet trained, and writes the table of what is; 2 where a run was skipped, else 0."""
+    runs = chosen(options.only)
     environment = dict(os.environ, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1", MKL_NUM_THREADS="1")
-    if args.core is not None:
+    if options.core is not None:
         if not hasattr(os, "sched_setaffinity"):
-            raise InputError(f"--core {args.core}: this system cannot pin a process to a core; leave it out.")
-        if args.core not in os.sched_getaffinity(0):
-            raise InputError(f"--core {args.core}: there is no such core for this process.")
-        os.sched_setaffinity(0, {args.core})  # the scoring below; children inherit it
+            raise InputError(f"--core {options.core}: this system cannot pin a process to a core; leave it out.")
+        if options.core not in os.sched_getaffinity(0):
+            raise InputError(f"--core {options.core}: there is no such core for this process.")
+        os.sched_setaffinity(0, {options.core})  # the scoring below; children inherit it
     skipped = []
-    if not args.table:
+    if not options.table:
         for n, r in enumerate(runs):
-            reason = unknown_option(r, args)
+            reason = unknown_option(r, options)
             if reason:
                 print(f"{r.name}: skipped, `timesplat train` says: {reason}", file=sys.stderr)
                 skipped.append(r.name)
                 continue
             print(f"[{n + 1}/{len(runs)}] {r.name}: {r.change}", flush=True)
             try:
-                train(r, args, environment)
+                train(r, options, environment)
             except InputError as e:  # one broken variant must not cost the night of the others
-                print(f"compare: {e}", file=sys.stderr)
+                print(f"ablations: {e}", file=sys.stderr)
                 skipped.append(r.name)
-    print(tabulate(args, command))
+    print(tabulate(options, command))
     return 2 if skipped else 0
 
 
@@ -138,13 +158,13 @@ def chosen(only: str | None) -> list[Run]:
 # ---------------------------------------------------------------- training
 
 
-def stages(r: Run, args: argparse.Namespace) -> list[tuple[Path, list[str]]]:
+def stages(r: Run, options: AblationOptions) -> list[tuple[Path, list[str]]]:
     """(run folder, arguments of `timesplat train`) of each stage; the last one's weights are scored."""
-    steps = r.steps or args.steps
-    data = [str(args.data / d) for d in r.data]
+    steps = r.steps or options.steps
+    data = [str(options.data / d) for d in r.data]
     if r.first is None:
-        return [(args.out / r.name, arguments(data, args.out / r.name, steps, {**BASE, **r.options}))]
-    first, last = args.out / r.name / "first", args.out / r.name
+        return [(options.out / r.name, arguments(data, options.out / r.name, steps, {**BASE, **r.options}))]
+    first, last = options.out / r.name / "first", options.out / r.name
     init = {"--init": first / "network.safetensors"}
     return [
         (first, arguments(data, first, steps // 2, {**BASE, **r.options, **r.first})),
@@ -159,13 +179,13 @@ def arguments(data: list[str], out: Path, steps: int, options: dict) -> list[str
     return words
 
 
-def unknown_option(r: Run, args: argparse.Namespace) -> str | None:
+def unknown_option(r: Run, options: AblationOptions) -> str | None:
     """What `timesplat train` has against a run's options; None where it takes them."""
     from ..cli import train_arguments
 
     parser = argparse.ArgumentParser(prog="train")
     train_arguments(parser)
-    for _, words in stages(r, args):
+    for _, words in stages(r, options):
         said = io.StringIO()
         try:
             with contextlib.redirect_stderr(said):
@@ -175,13 +195,12 @@ def unknown_option(r: Run, args: argparse.Namespace) -> str | None:
     return None
 
 
-def train(r: Run, args: argparse.Namespace, environment: dict) -> None:
-    for folder, words in stages(r, args):
+def train(r: Run, options: AblationOptions, environment: dict) -> None:
+    for folder, words in stages(r, options):
         if finished(folder, words):
             continue
         folder.mkdir(parents=True, exist_ok=True)
-        replace(folder / "command.txt", shlex.join(["timesplat", "train", *words]).encode())
-        (folder / "score.json").unlink(missing_ok=True)
+        write_whole(folder / "command.txt", shlex.join(["timesplat", "train", *words]).encode())
         code = run_child([sys.executable, "-m", "timesplat.cli", "train", *words], environment)
         if code in (130, -signal.SIGINT):
             raise KeyboardInterrupt
@@ -223,62 +242,95 @@ def complete(folder: Path) -> bool:
 # ---------------------------------------------------------------- scores
 
 
-def tabulate(args: argparse.Namespace, command: str) -> str:
-    """Scores what is finished and not yet scored, and writes the table of everything finished."""
-    import torch
-    from tqdm import tqdm
-
-    torch.set_num_threads(1)
-    ready = [r for r in RUNS if all(complete(folder) for folder, _ in stages(r, args))]
-    sets: dict[tuple, list] = {}
-    for r in tqdm(ready, desc="scoring", unit="run", disable=None):
-        folder = stages(r, args)[-1][0]
-        if not (folder / "score.json").is_file():
-            shrink = int({**BASE, **r.options}["--shrink"])
-            if shrink not in sets:
-                sets[shrink] = held_out(args.dev or args.data / "dev", shrink, args.objects)
-            replace(folder / "score.json", json.dumps(score(folder, sets[shrink])).encode())
+def tabulate(options: AblationOptions, command: str) -> str:
+    """Scores what is finished, and writes the table of everything finished."""
+    ready = [r for r in RUNS if all(complete(folder) for folder, _ in stages(r, options))]
     if not ready:
-        raise InputError(f"{args.out}: no finished run to make a table of.")
-    head = [
-        "run",
-        "what changes",
-        "pixels",
-        "parameters",
-        "steps",
-        "CPU-s",
-        "CPU-s/step",
-        "PSNR",
-        "PSNR fg",
-        f"PSNR − {ready[0].name}",
-    ]
-    head += ["training PSNR, first report", "last"]
-    white = json.loads((stages(ready[0], args)[-1][0] / "score.json").read_text())
-    rows = [row(r, args, white) for r in ready]
+        raise InputError(f"{options.out}: no finished run to make a table of.")
+    scores = score(ready, options)
+    head = ["run", "what changes", "pixels", "parameters", "steps", "CPU-s", "CPU-s/step"]
+    head += ["PSNR", "PSNR fg", f"PSNR − {ready[0].name}", "training PSNR, first report", "last"]
+    base = scores[ready[0].name]
+    rows = [row(r, options, scores[r.name], base) for r in ready]
     notes = [
-        f"PSNR in dB over white, mean ± standard error over {len(white['psnr'])} held-out objects (24 alternating "
+        f"PSNR in dB over white, mean ± standard error over {len(base.psnr)} held-out objects (24 alternating "
         "canonical inputs, 24 novel views each); fg: over the pixels that show the object; "
         "the difference is taken object by object. The empty picture "
-        f"scores {np.mean(white['white']):.2f} and {np.mean(white['white_fg']):.2f} at {white['pixels']}².",
+        f"scores {np.mean(base.white):.2f} and {np.mean(base.white_fg):.2f} at {base.pixels}².",
         "Every run: " + " ".join(f"{k} {v}" for k, v in BASE.items()) + f"; on {' and '.join(DATA)}, one core.",
     ]
-    return write_table(args.out / "comparisons", "Training comparisons", head, rows, command, notes)
+    made_by = Provenance.of(command, [weights_of(r, options) for r in ready])
+    return write_table(options.out / "comparisons", "Training comparisons", head, rows, made_by, notes)
 
 
-def row(r: Run, args: argparse.Namespace, base: dict) -> list[str]:
+def weights_of(r: Run, options: AblationOptions) -> Path:
+    """The averaged weights of a run's last stage."""
+    return stages(r, options)[-1][0] / "network.safetensors"
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Of one run, a figure per held-out object, and those of the empty picture."""
+
+    pixels: int
+    psnr: list[float]
+    psnr_fg: list[float]
+    white: list[float]
+    white_fg: list[float]
+
+
+def score(ready: list[Run], options: AblationOptions) -> dict[str, Scores]:
+    """{run: Scores} on the held-out Sequences, at the size at which a run was trained; kept in rows.jsonl."""
+    held_out = objects(options.dev or options.data / "dev", options.objects)
+    runs, at = [], []
+    for r in ready:
+        source = str({**BASE, **r.options}["--source"])
+        method = {"given": "guided", "sweep": "sweep", "predicted": "predicted"}[source]
+        shrink = int({**BASE, **r.options}["--shrink"])
+        for spec in (parse_spec(f"{r.name}={method}@{weights_of(r, options)}"), parse_spec("white")):
+            for name, seq in held_out.items():
+                views = (tuple(protocol.all_inputs(seq)), tuple(protocol.held_out(seq)))
+                runs.append(runner.Run(name, seq.root, spec, *views, seq.width // shrink))
+                at.append((r.name, spec.label))
+    conditions = runner.Conditions(left_out=tuple(k for k in METRICS if k not in ("psnr", "psnr_fg")), one_thread=True)
+    rows = runner.run_all(runs, Cache(options.out), conditions, "scoring")
+    found: dict[tuple, list[dict]] = {}
+    for key, x in zip(at, rows, strict=True):
+        found.setdefault(key, []).append(x)
+
+    def figures(name: str, label: str) -> tuple[list[float], list[float]]:
+        return tuple([x[k] for x in found[name, label]] for k in ("psnr", "psnr_fg"))
+
+    return {
+        r.name: Scores(found[r.name, r.name][0]["size"], *figures(r.name, r.name), *figures(r.name, "white"))
+        for r in ready
+    }
+
+
+def objects(folder: Path, limit: int | None) -> dict[str, Sequence]:
+    """The held-out Sequences below a folder, by name; each has inputs and views of the rig `target`."""
+    found = sequences_in(folder)[:limit]
+    if not found:
+        raise InputError(f"{folder}: no Sequence in it; render some with `timesplat render`.")
+    out = {n: read_sequence(f) for n, f in name_sequences(found).items()}
+    for seq in out.values():
+        protocol.held_out(seq)
+    return out
+
+
+def row(r: Run, options: AblationOptions, scores: Scores, base: Scores) -> list[str]:
     """`base`: the scores of the first run, from which the others' differ object by object."""
-    scores = json.loads((stages(r, args)[-1][0] / "score.json").read_text())
-    logs = [read_log(folder) for folder, _ in stages(r, args)]
+    logs = [read_log(folder) for folder, _ in stages(r, options)]
     steps = sum(log[-1]["step"] for log in logs)
     cpu = sum(log[-1].get("cpu_seconds", log[-1]["seconds"]) for log in logs)
 
     def mean(x):
         return f"{np.mean(x):.2f} ± {np.std(x, ddof=1) / len(x) ** 0.5:.2f}" if len(x) > 1 else f"{np.mean(x):.2f}"
 
-    cells = [r.name, r.change, f"{scores['pixels']}²", f"{scores['parameters'] / 1e6:.2f} M", str(steps)]
-    cells += [f"{cpu:.0f}", f"{cpu / steps:.3f}", mean(scores["psnr"]), mean(scores["psnr_fg"])]
-    alike = scores["white"] == base["white"]  # the same objects at the same size
-    cells.append(mean(np.subtract(scores["psnr"], base["psnr"])) if alike else "–")
+    cells = [r.name, r.change, f"{scores.pixels}²", f"{parameters(weights_of(r, options)) / 1e6:.2f} M", str(steps)]
+    cells += [f"{cpu:.0f}", f"{cpu / steps:.3f}", mean(scores.psnr), mean(scores.psnr_fg)]
+    alike = scores.white == base.white  # the same objects at the same size
+    cells.append(mean(np.subtract(scores.psnr, base.psnr)) if alike else "–")
     return [*cells, f"{logs[0][0]['psnr']:.2f}", f"{logs[-1][-1]['psnr']:.2f}"]
 
 
@@ -296,46 +348,12 @@ def read_log(folder: Path) -> list[dict]:
     return [lines[k] for k in sorted(lines)]
 
 
-def held_out(folder: Path, by: int, limit: int | None) -> list[tuple]:
-    """[(input views with passes, target views)] of the Sequences below a folder, shrunk."""
-    from ..datagen.sequence import read_sequence, sequences_in
-    from ..model.training.dataset import shrink
-    from ..model.views import load_views
+def parameters(weights: Path) -> int:
+    """How many a network has."""
+    from safetensors import safe_open
 
-    found = sequences_in(folder)[:limit]
-    if not found:
-        raise InputError(f"{folder}: no Sequence in it; render some with `timesplat render`.")
-    pairs = []
-    for f in found:
-        seq = read_sequence(f)
-        inputs, targets = ([i for i, v in enumerate(seq.views) if (v.rig == "target") == t] for t in (False, True))
-        if not inputs or not targets:
-            raise InputError(f"{f}: it needs input views and views of the rig `target` to score.")
-        pairs.append([shrink(load_views(seq, i, passes=True), by) for i in (inputs, targets)])
-    return pairs
-
-
-def score(folder: Path, pairs: list[tuple]) -> dict:
-    """Per-object scores of a run's averaged weights, and of the empty picture."""
-    import torch
-
-    from ..model.reconstruct import apply_network, load_network
-    from .evaluate import draw
-    from .metrics import psnr, psnr_foreground
-
-    network = load_network(folder / "network.safetensors")
-    out = {"psnr": [], "psnr_fg": [], "white": [], "white_fg": []}
-    for inputs, targets in pairs:
-        with torch.inference_mode():
-            rgb, alpha = draw(apply_network(network, inputs), targets)
-        truth = targets.over(1.0)
-        empty = torch.ones_like(truth)
-        out["psnr"].append(float(psnr(rgb, truth).mean()))
-        out["psnr_fg"].append(float(psnr_foreground(rgb, truth, alpha, targets.alpha).mean()))
-        out["white"].append(float(psnr(empty, truth).mean()))
-        out["white_fg"].append(float(psnr_foreground(empty, truth, alpha * 0, targets.alpha).mean()))
-    parameters = sum(p.numel() for p in network.parameters())
-    return out | {"pixels": pairs[0][1].size[0], "parameters": parameters}
+    with safe_open(weights, "pt") as f:
+        return sum(int(np.prod(f.get_slice(k).get_shape())) for k in f.keys())  # noqa: SIM118
 
 
 if __name__ == "__main__":

@@ -1,110 +1,168 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Speed against accuracy: every way from posed images to novel views, on the same held-out objects.
+"""`timesplat bench`: speed against accuracy, every way from posed images to novel views on the same held-out objects.
 
-A way is written as in bench.csv: NAME[@WEIGHTS][:SECONDS][+OPTIONS], for example `guided`, `4dgs:10` (fitted for ten
-seconds), `guided@small` (the checkpoint guided-small) or `guided+refine:10+budget:10%` (options as
-`evaluate.parse_method` takes them). A full cross of ways, inputs and sizes would take days, so the axes go through
-one centre: 24 views, one random one a frame, 128x128 pixels.
-
-    points, notes = plan(sequences)
-    rows = run(sequences, points, out)          # rows.jsonl, from which an interrupted run goes on
-
-Scored are the held-out views (rig "target"), which no input shows. Seconds are processor seconds of one thread.
+A full cross of methods, inputs and sizes would take days, so the axes go through one centre: 24 views, one random one
+a frame, 128x128 pixels. Scored are the held-out views (rig "target"), which no input shows. Seconds are processor
+seconds of one thread. The pictures and the page are `charts`', from bench.csv alone.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import re
-import signal
-import tempfile
+import argparse
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
+from datetime import date
 from importlib.util import find_spec
 from pathlib import Path
 
-import torch
 from tqdm import tqdm
 
-from ..datagen.sequence import InputError, Sequence, read_sequence
-from ..model.fitting.budget import SECONDS
-from ..model.geometry.coverage import SURFACES, coverage
-from ..model.io.asset import write_ply
-from ..model.parallel import clock
-from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, clip_of
-from ..model.views import Views
-from . import protocol
-from .evaluate import Plan, append, draw, evaluate_views, key_of, load_inputs, load_truth, parse_method, read_rows
-from .evaluate import warm_up as warm_up_methods
+from ..datagen.sequence import InputError, Sequence
 
 # No checkpoint was trained on these seeds, and nothing was tuned on them.
-HELD_OUT = [f"zoo:{seed}" for seed in range(1_000_100, 1_000_106)]
-SIZE, SIZES = 128, (64, 128, 256)
-FITS = (1, 3, 10, 30)  # seconds
-BUDGETS = ("2.5%", "5%", "10%", "25%", "auto")
-VIEWS = (4, 8, 12, 48)
-CENTRE = ["lift", "guided", "rgb", "predicted", "gs-lrm-all", "gs-lrm-frame", "hull"]
-CENTRE += ["guided+dense", "rgb+dense", "predicted+dense"]
-CENTRE += [f"{name}:{s}" for name in ("4dgs", "som") for s in FITS]
-CENTRE += [f"{name}+refine:{s}" for name in ("guided", "rgb") for s in FITS]
-CENTRE += [f"rgb+refine:{s}" for s in (0.1, 0.3, 0.6, 2)]
-CENTRE += [f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in BUDGETS]
-CENTRE += [f"rgb+refine:3+budget:{n}" for n in (500, 1000, "auto")]
-AXES = ["lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3"]  # at other sizes and numbers of views
-QUICK = 3.0  # seconds of fitting that a quick run has at the most
-
-FIGURES = ["seconds", "psnr", "psnr_fg", "ssim", "flip", "gaussians", "ply_mb", "usd_mb", "render_ms"]
-FIGURES += ["coverage"]  # of the object by the views, where it can be told
-COLUMNS = ["object", "way", "setup", "views", "size", *FIGURES]
+HELD_OUT = tuple(f"zoo:{seed}" for seed in range(1_000_100, 1_000_106))
 
 
 @dataclass(frozen=True)
-class Way:
-    """From views to a scene."""
+class Axes:
+    """What is run: methods at the centre, and some of them at other sizes and numbers of views."""
 
-    label: str
-    name: str  # of METHODS
-    spec: str  # what `evaluate.parse_method` takes
-    weights: str = ""  # of the checkpoint, after the name of the method's own
-    seconds: float = 0.0  # of fitting, for methods that fit a scene
-
-    @property
-    def passes(self) -> bool:
-        """Whether it sees depth and motion, not RGB and alpha alone."""
-        return self.name in NEEDS_PASSES
-
-    @property
-    def baseline(self) -> bool:
-        return not METHODS[self.name].startswith("ours")
-
-    @property
-    def fit(self) -> float:
-        """Seconds of fitting in all, without what `auto` takes to find its number."""
-        wanted = parse_method(self.spec)
-        return self.seconds + (wanted.refine or (SECONDS if wanted.budget else 0.0))
-
-    @property
-    def checkpoint(self) -> Path | None:
-        return CHECKPOINTS / f"{WEIGHTS.get(self.name, self.name)}-{self.weights}.safetensors" if self.weights else None
+    size: int = 128  # pixels, of the centre
+    sizes: tuple[int, ...] = (64, 128, 256)
+    views: tuple[int, ...] = (4, 8, 12, 48)
+    centre: tuple[str, ...] = (
+        *("lift", "guided", "rgb", "predicted", "gs-lrm-all", "gs-lrm-frame", "hull"),
+        *("guided+dense", "rgb+dense", "predicted+dense"),
+        *(f"{name}:{s}" for name in ("4dgs", "som") for s in (1, 3, 10, 30)),
+        *(f"{name}+refine:{s}" for name in ("guided", "rgb") for s in (1, 3, 10, 30)),
+        *(f"rgb+refine:{s}" for s in (0.1, 0.3, 0.6, 2)),
+        *(f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in ("2.5%", "5%", "10%", "25%", "auto")),
+        *(f"rgb+refine:3+budget:{n}" for n in (500, 1000, "auto")),
+    )
+    elsewhere: tuple[str, ...] = ("lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3")
+    quick: float = 3.0  # seconds of fitting that a quick run has at the most
 
 
-def parse(label: str) -> Way:
-    """Raises InputError for what is no way."""
-    match = re.fullmatch(r"([^+@:]+)(?:@([\w-]+))?(?::(\d+(?:\.\d+)?))?(\+.+)?", label.strip())
-    if not match:
-        raise InputError(f"{label}: write a way as NAME[@WEIGHTS][:SECONDS][+OPTIONS], for example 4dgs:10.")
-    name, weights, seconds, options = match.groups(default="")
-    spec = name + options
-    parse_method(spec)
-    if (name in ("4dgs", "som")) != bool(seconds):
-        raise InputError(f"{label}: 4dgs and som, and they alone, take seconds; write for example 4dgs:10.")
-    way = Way(label.strip(), name, spec, weights, float(seconds or 0))
-    if way.checkpoint and not way.checkpoint.is_file():
-        raise InputError(f"{label}: there is no checkpoint {way.checkpoint.name}; name one in {CHECKPOINTS}.")
-    return way
+AXES = Axes()
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What `timesplat bench` is asked for; see `add_arguments`."""
+
+    assets: list[str]
+    out: Path = Path("out/bench")
+    command: str = ""  # as it was typed, for tables and charts
+    objects: int | None = None
+    quick: bool = False
+    methods: str | None = None
+    renderer: bool = False
+    size: int = 128
+    jobs: int = 2
+    limit: float | None = None
+    device: str = "cpu"
+    draw: Path | None = None
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """The arguments of `timesplat bench`."""
+    d = BenchOptions([])
+    p.add_argument("assets", nargs="*", help="animated files, zoo:SEED, Sequences rendered with --rig evaluation "
+                   "--targets 1, or folders of either (default: 6 procedural objects no checkpoint saw)")  # fmt: skip
+    p.add_argument("--out", type=Path, default=d.out, help="folder to write (default: %(default)s); another one after "
+                   "changing the code, as rows are kept")  # fmt: skip
+    p.add_argument("--objects", type=int, help="only the first N objects")
+    p.add_argument("--quick", action="store_true", help="2 objects unless --objects says, no fit of more than 3 "
+                   "seconds, no chart of the renderer: some 4 minutes")  # fmt: skip
+    p.add_argument("--methods", help="only these, at the centre: comma-separated, written as in bench.csv, for "
+                   "example guided,4dgs:10,rgb+refine:3")  # fmt: skip
+    p.add_argument("--renderer", action="store_true", help="only the chart of the renderer: some 2 minutes")
+    p.add_argument("--size", type=int, default=d.size, help="pixels to render at; 256 adds that size "
+                   "(default: %(default)s)")  # fmt: skip
+    p.add_argument("--jobs", type=int, default=d.jobs, help="processes, one core each (default: %(default)s)")
+    p.add_argument("--limit", type=float, help="seconds after which nothing is started; the charts are then of what "
+                   "all objects have, and the same command goes on")  # fmt: skip
+    p.add_argument("--device", default=d.device, help="where methods run: cpu or cuda (default: %(default)s)")
+    p.add_argument("--draw", type=Path, metavar="CSV", help="only draw again, from a bench.csv")
+
+
+def bench(options: BenchOptions) -> int:
+    """The command; 2 where an object could not be rendered, else 0. Raises InputError."""
+    _check(options)
+    from . import charts
+
+    if options.draw:
+        print(charts.draw(options.draw))
+        return 0
+    started = time.time()
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.renderer:
+        measure_renderer(options.out / "bench-renderer.csv", options.jobs)
+        print(options.out / f"{charts.draw_renderer(options.out / 'bench-renderer.csv')}.png")
+        return 0
+    failures = measure(options, started)
+    print(charts.draw(options.out / "bench.csv"))
+    return 2 if failures else 0
+
+
+def _check(options: BenchOptions) -> None:
+    """Raises InputError for options that cannot be, and for what is not installed, before anything runs."""
+    if not find_spec("matplotlib"):
+        raise InputError("matplotlib is not installed; pip install 'timesplat[figures]'.")
+    if options.renderer and not find_spec("bpy"):
+        raise InputError("bpy is not installed; pip install 'timesplat[render]'.")
+    for name in ("objects", "jobs"):
+        if getattr(options, name) is not None and getattr(options, name) < 1:
+            raise InputError(f"--{name} {getattr(options, name)}: give 1 or more.")
+    if options.limit is not None and options.limit <= 0:
+        raise InputError(f"--limit {options.limit:g}: give more than 0 seconds.")
+    if options.size % 64:
+        raise InputError(f"--size {options.size}: give 64, 128 or 256.")
+
+
+def measure(options: BenchOptions, started: float) -> list[str]:
+    """Writes bench.csv; -> what could not be rendered."""
+    from ..datagen.render import Settings
+    from ..model.reconstruct import check_device
+    from .bench_summary import bench_row, write_csv
+    from .cache import Cache
+    from .method_spec import parse_specs
+    from .provenance import Provenance, machine, versions
+    from .runner import Conditions, run_all
+
+    check_device(options.device)
+    chosen = [m.label for m in parse_specs(options.methods)] if options.methods else None
+    number = options.objects or (2 if options.quick else None)
+    cache, settings = Cache(options.out), Settings(rig="evaluation", targets=1, size=options.size)
+    sequences, failures = cache.sequences(options.assets or list(HELD_OUT[:number]), settings, options.jobs)
+    sequences = dict(list(sequences.items())[:number])
+    if not sequences:
+        raise InputError(f"{options.assets[0]}: nothing to measure; none of the assets could be rendered.")
+    points, notes = plan(sequences, options.quick, chosen)
+    if not (options.quick or options.methods):
+        measure_renderer(options.out / "bench-renderer.csv", options.jobs)
+    deadline = started + options.limit if options.limit is not None else float("inf")
+    how = Conditions(
+        costs=True, one_thread=True, device=options.device, jobs=options.jobs, started=started, deadline=deadline
+    )
+    rows = run_all(runs_of(sequences, points), cache, how, "measuring")
+    if not rows:
+        raise InputError(f"{options.out}: nothing was measured in the time given; allow more.")
+    order = {(p.label, p.setup, p.size): i for i, p in enumerate(points)}
+    rows = sorted(map(bench_row, rows), key=lambda r: order[r["way"], r["setup"], r["size"]])
+    made = Provenance.of(options.command, [p.method.weights for p in points])
+    facts = {
+        "date": date.today().isoformat(),
+        "machine": machine(),
+        "versions": versions(),
+        "jobs": options.jobs,
+        "seconds_total": round(cache.seconds_spent(), 1),
+        "centre": [points[0].setup, points[0].size],
+        "notes": notes,
+        "made_by": str(made),
+    }
+    write_csv(options.out / "bench.csv", rows, options.command, facts)
+    return failures
 
 
 # ---------------------------------------------------------------- what is run
@@ -112,215 +170,116 @@ def parse(label: str) -> Way:
 
 @dataclass(frozen=True)
 class Point:
-    """A way in a setup of `protocol` ("" for all views that are not held out) at a size in pixels."""
+    """A method in a setup of `protocol` ("" for all views that are not held out) at a size in pixels."""
 
     label: str
     setup: str
     size: int
 
+    @property
+    def method(self):
+        """Its MethodSpec."""
+        from .method_spec import parse_spec
 
-def plan(sequences: dict[str, Sequence], quick: bool = False, methods: list[str] | None = None):
-    """-> Points, those of the centre first; and sentences on what is left out, and why. `methods`: these ways alone, at
-    the centre. Raises InputError where objects have nothing in common to be measured at."""
+        return parse_spec(self.label, seconds=10.0)
+
+
+def plan(
+    sequences: dict[str, Sequence], quick: bool = False, methods: list[str] | None = None, axes: Axes = AXES
+) -> tuple[list[Point], list[str]]:
+    """-> Points, those of the centre first; and sentences on what is left out, and why. `methods`: these alone, at the
+    centre. Raises InputError where objects have nothing in common to be measured at."""
+    from . import protocol
+    from .method_spec import parse_spec
+
     for seq in sequences.values():
-        _held_out(seq)
-    labels, notes = methods or [*CENTRE, *_other_weights()], []
+        protocol.held_out(seq)
+    labels, notes = methods or [*axes.centre, *_other_weights()], []
+    specs = {x: parse_spec(x, seconds=10.0) for x in labels}
     if lacking := [n for n, s in sequences.items() if not all(v.passes for v in s.views)]:
-        notes.append(f"No depth-guided way: {lacking[0]} has no depth and motion passes.")
-        labels = [x for x in labels if not parse(x).passes]
-    labels = [x for x in labels if not quick or parse(x).fit <= QUICK]
+        notes.append(f"No depth-guided method: {lacking[0]} has no depth and motion passes.")
+        labels = [x for x in labels if not specs[x].has_depth]
+    labels = [x for x in labels if not quick or specs[x].fit_seconds <= axes.quick]
     setup = next(s for s in ("random", "alternating", "") if all(_has(seq, s) for seq in sequences.values()))
     if setup != "random":
         notes.append("Inputs are not random views, nor of other numbers: not every object has the rig `evaluation`.")
-    sizes = [s for s in SIZES if all(seq.width % s == 0 and seq.height % s == 0 for seq in sequences.values())]
-    size = SIZE if SIZE in sizes else next(iter(sequences.values())).width
-    if SIZE not in sizes and any(seq.width != size for seq in sequences.values()):
-        raise InputError(f"Objects are not of one size, nor of multiples of {SIZE} pixels; render them at {SIZE}.")
+    sizes = [s for s in axes.sizes if all(seq.width % s == 0 and seq.height % s == 0 for seq in sequences.values())]
+    size = axes.size if axes.size in sizes else next(iter(sequences.values())).width
+    if axes.size not in sizes and any(seq.width != size for seq in sequences.values()):
+        raise InputError(
+            f"Objects are not of one size, nor of multiples of {axes.size} pixels; render them at {axes.size}."
+        )
     points = [Point(x, setup, size) for x in labels]
-    others = [] if methods else [x for x in AXES if x in labels]
+    others = [] if methods else [x for x in axes.elsewhere if x in labels]
     points += [Point(x, setup, s) for s in sizes if s != size for x in others]
-    counts = [f"views-{n}" for n in VIEWS if setup == "random"]
+    counts = [f"views-{n}" for n in axes.views if setup == "random"]
     counts = [c for c in counts if all(_has(seq, c) for seq in sequences.values())]
     points += [Point(x, c, size) for c in counts for x in others]
-
     return points, notes
 
 
 def _other_weights() -> list[str]:
-    """Ways with checkpoints of other sizes, which are named METHOD-….safetensors."""
+    """Methods with shipped checkpoints of other sizes, which are named METHOD-….safetensors."""
+    from ..model.reconstruct import CHECKPOINTS, WEIGHTS
+
     names = [(n, WEIGHTS.get(n, n)) for n in ("guided", "rgb", "predicted")]
     return [f"{n}@{f.stem[len(w) + 1 :]}" for n, w in names for f in sorted(CHECKPOINTS.glob(f"{w}-*.safetensors"))]
 
 
 def _has(seq: Sequence, setup: str) -> bool:
     try:
-        return bool(_chosen(seq, setup))
+        return bool(_inputs(seq, setup))
     except InputError:
         return False
 
 
-def _chosen(seq: Sequence, setup: str) -> list[int]:
-    return protocol.inputs(seq, setup) if setup else [i for i, v in enumerate(seq.views) if v.rig != "target"]
+def _inputs(seq: Sequence, setup: str) -> list[int]:
+    from . import protocol
+
+    return protocol.inputs(seq, setup) if setup else protocol.all_inputs(seq)
 
 
-def _held_out(seq: Sequence) -> list[int]:
-    found = seq.select(rig="target")
-    if not found:
-        raise InputError(f"{seq.root}: no held-out views to score; render it with --rig evaluation --targets 1.")
-    return found
+def runs_of(sequences: dict[str, Sequence], points: list[Point], axes: Axes = AXES) -> list:
+    """A Run for each Point on each object {name: Sequence}: quick ones at the centre, quick ones elsewhere, then the
+    slow ones by their seconds. Each stage goes object by object (what is loaded serves several), so that a session cut
+    short has made whole points."""
+    from . import protocol
+    from .runner import Run
 
-
-# ---------------------------------------------------------------- running
-
-
-@lru_cache(maxsize=2)
-def _views(root: Path, setup: str, size: int) -> Views:
-    seq = read_sequence(root)
-    chosen = _chosen(seq, setup)
-    return load_inputs(seq, chosen, all(seq.views[i].passes for i in chosen), size)
-
-
-@lru_cache(maxsize=4)
-def _truth(root: Path, size: int):
-    seq = read_sequence(root)
-    return load_truth(seq, _held_out(seq), _held_out(seq), size)
-
-
-def measure(name: str, seq: Sequence, point: Point) -> dict:
-    """One row: COLUMNS of a Point on an object. None where a figure cannot be: a scene that is no 4D Gaussians has
-    no files, for example."""
-    way, views, truth = parse(point.label), _views(seq.root, point.setup, point.size), _truth(seq.root, point.size)
-    what = views if way.passes else replace(views, depth=None, flow=None)
-    row, scene = evaluate_views(what, way.spec, truth, way.checkpoint, None, way.seconds)
-    start = clock()
-    draw(scene, truth.views)
-    row["render_ms"] = 1000 * (clock() - start) / len(truth.picture)
-    row["ply_mb"], row["usd_mb"] = megabytes(scene, seq)
-    row["coverage"] = coverage(scene, what)[0] if way.spec in SURFACES else None
-    row |= {"gaussians": row["gaussians_kept"], "object": name, "way": way.label, "setup": point.setup}
-    row |= {"views": len(views), "size": point.size}
-    return {k: row[k] for k in COLUMNS}
-
-
-def megabytes(scene, seq: Sequence) -> tuple[float | None, float | None]:
-    """Of the scene as .ply and, where pxr is installed, as .usdc."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        ply, usd = Path(folder) / "a.ply", Path(folder) / "a.usdc"
-        try:
-            asset = scene.to_asset(clip_of(seq))
-        except InputError:
-            return None, None
-        write_ply(ply, asset)
-        if find_spec("pxr"):
-            from ..model.io.usd_write import write_usd
-
-            write_usd(usd, asset)
-        return ply.stat().st_size / 1e6, usd.stat().st_size / 1e6 if usd.exists() else None
-
-
-def key(seq: Sequence, point: Point) -> str:
-    """Names a row by all that has a say in it but the code, as `evaluate.key_of` does."""
-    way = parse(point.label)
-    how = Plan((), checkpoint=way.checkpoint, seconds=way.seconds)
-    return key_of(seq, point.setup, point.size, 1, way.spec, how, False)
-
-
-def run(
-    sequences: dict[str, Sequence],
-    points: list[Point],
-    out: Path,
-    jobs: int = 1,
-    deadline: float = float("inf"),
-    started: float | None = None,
-) -> list[dict]:
-    """Every Point on every object {name: Sequence}; -> rows, in the order of the points. Those in out/rows.jsonl are
-    taken from there, others appended as soon as they are made. Nothing is started after `deadline` (time.time());
-    `started` is when the session began, for `spent`."""
-    out.mkdir(parents=True, exist_ok=True)
-    with open(out / "rows.jsonl", "ab") as f:
-        f.write(b"\n" if f.tell() else b"")  # ends a line that was cut off
-    known = read_rows(out / "rows.jsonl")
-    units = [(n, p) for i in _stages(points) for n in sequences for p in i]
-    keys = {u: key(sequences[u[0]], u[1]) for u in units}
-    todo = [(n, sequences[n].root, p, keys[n, p]) for n, p in units if keys[n, p] not in known]
-    setting = (started or time.time(), deadline, [p.label for _, _, p, _ in todo])
-    with tqdm(total=len(units), initial=len(units) - len(todo), desc="measuring", unit="run", disable=None) as bar:
-        for row in _map(todo, setting, jobs):
-            if row:
-                append(out / "rows.jsonl", row)
-                known[row["key"]] = row
-            bar.update()
-    order = [(n, p) for p in points for n in sequences]
-    return [known[keys[u]] | {"object": u[0]} for u in order if keys[u] in known]
-
-
-def _stages(points: list[Point]) -> list[list[Point]]:
-    """Quick ones at the centre, quick ones elsewhere, then the slow ones by their seconds: each stage is made object by
-    object (what is loaded serves several), and a run cut short has made whole points."""
     stages: dict[tuple, list[Point]] = {}
     for p in points:
-        fit = parse(p.label).fit
-        elsewhere = (p.setup, p.size) != (points[0].setup, points[0].size)
-        stages.setdefault((fit, False) if fit > QUICK else (0, elsewhere), []).append(p)
-    return [stages[k] for k in sorted(stages)]
+        fit, elsewhere = p.method.fit_seconds, (p.setup, p.size) != (points[0].setup, points[0].size)
+        stages.setdefault((fit, False) if fit > axes.quick else (0, elsewhere), []).append(p)
+    return [
+        Run(
+            n, seq.root, p.method, tuple(_inputs(seq, p.setup)), tuple(protocol.held_out(seq)), p.size,
+            {"setup": p.setup},
+        )
+        for k in sorted(stages) for n, seq in sequences.items() for p in stages[k]
+    ]  # fmt: skip
 
 
-def spent(rows_file: Path) -> float:
-    """Seconds by the clock that all sessions that wrote to a rows.jsonl took."""
-    sessions: dict[float, float] = {}
-    for row in read_rows(rows_file).values():
-        if "session" in row:
-            sessions[row["session"]] = max(sessions.get(row["session"], 0.0), row["elapsed"])
-    return sum(sessions.values())
+# ---------------------------------------------------------------- the renderer
 
 
-_setting: dict = {}
-
-
-def _map(units: list, setting: tuple, jobs: int) -> Iterator[dict | None]:
-    """`_work` of every unit, in this process or in several of one core each; one thread each."""
-    if jobs == 1:
-        threads = torch.get_num_threads()
-        _start(setting)
-        try:
-            yield from map(_work, units)
-        finally:
-            torch.set_num_threads(threads)
+def measure_renderer(path: Path, jobs: int) -> None:
+    """bench-renderer.csv, if there is none yet, and Blender: as many objects at a time as `jobs`, one core each."""
+    if path.is_file() or not find_spec("bpy"):
         return
-    os.environ["OMP_NUM_THREADS"] = "1"  # read when the children load their libraries
-    context = multiprocessing.get_context("spawn")  # forked threads would hang
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    with context.Pool(min(jobs, max(len(units), 1)), _start, (setting, cores, context.Value("i", 0))) as pool:
-        yield from pool.imap_unordered(_work, units)
+    from ..benchmarks import renderer
+    from ..datagen.render import cores
+    from . import charts
 
-
-def _start(setting: tuple, cores: list[int] | None = None, number=None) -> None:
-    if number:  # a child: the parent tells it when to stop
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if cores:
-        with number.get_lock():
-            os.sched_setaffinity(0, {cores[number.value % len(cores)]})
-            number.value += 1
-    torch.set_num_threads(1)
-    _setting.update(zip(("started", "deadline", "labels"), setting, strict=True), warm=False)
-
-
-def _work(unit: tuple) -> dict | None:
-    name, root, point, key = unit
-    if time.time() >= _setting["deadline"]:
-        return None
-    seq = read_sequence(root)
-    if not _setting["warm"]:
-        _warm_up(seq, _chosen(seq, point.setup), _setting["labels"])
-        _setting["warm"] = True
-    row = measure(name, seq, point)
-    return row | {"key": key, "session": _setting["started"], "elapsed": time.time() - _setting["started"]}
-
-
-def _warm_up(seq: Sequence, inputs: list[int], labels: list[str]) -> None:
-    """Every kind of way once, on two views, so that no timing holds compilation or imports."""
-    kinds = {}
-    for way in map(parse, labels):
-        m = parse_method(way.spec)
-        kinds.setdefault((m.name, bool(m.refine), bool(m.budget)), way.spec)
-    warm_up_methods(seq, inputs, list(kinds.values()))
+    rows: list[dict] = []
+    with tqdm(total=len(renderer.OBJECTS), desc="renderer", unit="object", disable=None) as bar:
+        for first in range(0, len(renderer.OBJECTS), jobs):
+            batch, children = renderer.OBJECTS[first : first + jobs], []
+            try:
+                children += [renderer.start(a, cores()[i % len(cores())]) for i, a in enumerate(batch)]
+                for child, asset in zip(children, batch, strict=True):
+                    rows += renderer.finish(child, asset)
+                    bar.update()
+            finally:
+                for child in children:
+                    child.kill()
+    charts.write_renderer(path, rows, "timesplat bench --renderer")

@@ -3,14 +3,15 @@
 
 Beside the CSV: bench.md, bench-seconds, bench-size, bench-budgets and bench-inputs as SVG and PNG (those there are
 figures for), and bench-renderer from a bench-renderer.csv. Squares see depth and motion, circles RGB alone; ours are
-filled, baselines hollow. Bars are standard errors over objects of the paired differences to the way at the centre that
-sees the same (`guided`, `rgb`), which has none itself.
+filled, baselines hollow. Bars are standard errors over objects of the paired differences to the method at the
+centre that sees the same (`guided`, `rgb`), which has none itself.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from itertools import groupby
 from pathlib import Path
 
@@ -19,22 +20,25 @@ import numpy as np
 from ..benchmarks.renderer import COLUMNS as RENDERER
 from ..benchmarks.renderer import TRUTH
 from ..datagen.sequence import InputError
-from .bench import FIGURES
-from .evaluate import parse_method
-from .figures import COLOURS, MARKERS, panels, replace, save
+from .bench_summary import FIGURES, Mean, frontier, read_csv, summarise
+from .figures import COLOURS, MARKERS, panels, save, write_whole
 from .labels import plain, settle
-from .pareto import Mean, frontier, read_csv, summarise
+from .metrics import METRICS
 
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, BLACK, GREY = COLOURS
 FAMILIES = {"lift": BLACK, "guided": BLUE, "rgb": ORANGE, "sweep": ORANGE, "predicted": PINK, "gs-lrm-all": YELLOW}
 FAMILIES |= {"gs-lrm-frame": YELLOW, "hull": GREY, "white": GREY, "4dgs": GREEN, "som": SKY}
 SEES = {True: "depth + motion", False: "RGB alone"}
 NAMES = {"seconds": "seconds of one thread", "gaussians": "Gaussians", "ply_mb": "megabytes of the .ply"}
-NAMES |= {
-    "usd_mb": "megabytes of the .usdc",
-    "psnr": "PSNR of novel views (dB)",
-    "flip": "FLIP of novel views (upside down: up is better)",
-}
+NAMES |= {"usd_mb": "megabytes of the .usdc"}
+
+
+def axis_name(key: str) -> str:
+    """How an axis calls a figure."""
+    if key not in METRICS:
+        return NAMES[key]
+    m = METRICS[key]
+    return f"{m.axis} of novel views" + ("" if m.higher_is_better else " (upside down: up is better)")
 
 
 def draw(path: Path) -> str:
@@ -45,10 +49,10 @@ def draw(path: Path) -> str:
     centre = [m for m in means if (m.setup, m.size) == (setup, size)]
     pictures = []
     for name, costs, worths in (
-        ("seconds", ("seconds", "seconds"), ("psnr", "flip")),
+        ("seconds", ("seconds",) * len(charted(centre)), charted(centre)),
         ("size", ("gaussians", "usd_mb" if any(m.mean["usd_mb"] for m in centre) else "ply_mb"), ("psnr", "psnr")),
     ):
-        fig, axes = panels(2, 5.6, 4.8)
+        fig, axes = panels(len(costs), 5.6, 4.8)
         work = [trade(ax, centre, c, w) for ax, c, w in zip(axes, costs, worths, strict=True)]
         key(axes[0], centre)
         settle(fig, work)
@@ -61,8 +65,13 @@ def draw(path: Path) -> str:
     renderer = path.with_name(f"{path.stem}-renderer.csv")
     if renderer.is_file():
         pictures.append(draw_renderer(renderer))
-    replace(path.with_suffix(".md"), page(means, centre, rows, command, facts, pictures).encode())
+    write_whole(path.with_suffix(".md"), page(means, centre, rows, command, facts, pictures).encode())
     return frontiers(centre)
+
+
+def charted(means: list[Mean]) -> tuple[str, ...]:
+    """The metrics that get a panel: those meant for charts that every method has."""
+    return tuple(k for k, m in METRICS.items() if m.charted and all(x.mean[k] is not None for x in means))
 
 
 def _save(fig, path: Path, name: str, command: str) -> str:
@@ -71,14 +80,14 @@ def _save(fig, path: Path, name: str, command: str) -> str:
     return stem.name
 
 
-# ---------------------------------------------------------------- one way against another
+# ---------------------------------------------------------------- one method against another
 
 
 def kind(m: Mean) -> tuple:
     """What a line joins: fits of one method for several seconds, refinements of one, budgets of one."""
-    spec = parse_method(m.way.spec)
-    what = "budget" if spec.budget else "dense" if spec.dense else ""
-    return m.way.name, m.way.weights, what, spec.refine if spec.budget else None
+    method = m.method
+    what = "budget" if method.budget else "dense" if method.dense else ""
+    return method.method, method.checkpoint, what, method.refine if method.budget else None
 
 
 def lines(means: list[Mean]) -> dict[str, list[Mean]]:
@@ -88,17 +97,17 @@ def lines(means: list[Mean]) -> dict[str, list[Mean]]:
     for m in means:
         found.setdefault(kind(m), []).append(m)
     out = {}
-    for (name, weights, what, refine), group in found.items():
-        head = f"{name}@{weights}" if weights else name
+    for (name, _, what, refine), group in found.items():
+        head = re.split(r"[:+]", group[0].method.label)[0]  # with other weights, where it has them
         if what == "budget":
             whole = f"{head}+refine:{refine:g}" if refine else head
-            group = [m for m in means if m.way.label == whole] + group
+            group = [m for m in means if m.method.label == whole] + group
             out[f"{whole}+budget"] = sorted(group, key=lambda m: m.mean["gaussians"])
         elif what == "dense":
-            out |= {m.way.label: [m] for m in group}
+            out |= {m.method.label: [m] for m in group}
         else:
             refined = len(group) > 1 and name not in ("4dgs", "som")
-            out[f"{head}+refine" if refined else head] = sorted(group, key=lambda m: m.way.fit)
+            out[f"{head}+refine" if refined else head] = sorted(group, key=lambda m: m.method.fit_seconds)
     return out
 
 
@@ -106,39 +115,39 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
     """A panel: what ways cost (log) and are worth, with lines and both frontiers; -> what `place` takes. FLIP is drawn
     upside down, so that up is better."""
     means = [m for m in means if m.mean[cost]]
-    ax.set(xscale="log", xlabel=NAMES[cost], ylabel=NAMES[worth])
+    ax.set(xscale="log", xlabel=NAMES[cost], ylabel=axis_name(worth))
     labels, hints, drawn = [], [], []
     for label, group in lines(means).items():
         x, y = [m.mean[cost] for m in group], [m.mean[worth] for m in group]
-        colour, budget = FAMILIES[group[0].way.name], "budget" in label
+        colour, budget = FAMILIES[group[0].method.method], "budget" in label
         ax.plot(x, y, color=colour, linewidth=1, zorder=2, linestyle="--" if budget else "-")
         drawn.append((x, y))
         at = 0 if budget else -1
         labels.append((x[at], y[at], label, colour))
         if "refine" in label and not budget:
-            labels.append((x[0], y[0], group[0].way.label, colour))
+            labels.append((x[0], y[0], group[0].method.label, colour))
         if cost != "seconds":
             said = {h[:3] for h in hints}
             found = [(a, b, hint(m), colour) for a, b, m in zip(x, y, group, strict=True)]
             hints += [h for h in found if h[2] and h[:3] not in said]
     for m in means:
-        x, y, colour, error = m.mean[cost], m.mean[worth], FAMILIES[m.way.name], m.gain_error.get(worth, 0)
+        x, y, colour, error = m.mean[cost], m.mean[worth], FAMILIES[m.method.method], m.gain_error.get(worth, 0)
         drawn.append(([x, x], [y - error, y + error]))
         ax.errorbar(
             x, y, yerr=error or None, color=colour, ecolor=colour, elinewidth=0.8, capsize=2, linestyle="none",
-            marker="s" if m.way.passes else "o", zorder=4,
-            markersize=3 if cost == "seconds" and "budget" in m.way.spec else 5,
-            markerfacecolor="white" if m.way.baseline else colour,
+            marker="s" if m.method.has_depth else "o", zorder=4,
+            markersize=3 if cost == "seconds" and m.method.budget else 5,
+            markerfacecolor="white" if m.method.baseline else colour,
         )  # fmt: skip
-    for passes in (True, False):
-        best = on_frontier([m for m in means if m.way.passes == passes], cost, worth)
+    for has_depth in (True, False):
+        best = on_frontier([m for m in means if m.method.has_depth == has_depth], cost, worth)
         x, y = [m.mean[cost] for m in best], [m.mean[worth] for m in best]
         look = {"color": "#606060", "drawstyle": "steps-post", "zorder": 1}
         ax.plot(x, y, linewidth=5, alpha=0.15, **look)
-        ax.plot(x, y, linewidth=0.9, linestyle="-" if passes else ":", **look)
+        ax.plot(x, y, linewidth=0.9, linestyle="-" if has_depth else ":", **look)
         drawn.append((np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]))
     ax.margins(0.12, 0.08)
-    if worth == "flip":
+    if not METRICS[worth].higher_is_better:
         ax.invert_yaxis()
     plain(ax)
     dots = [(m.mean[cost], m.mean[worth]) for m in means]
@@ -147,14 +156,13 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
 
 def hint(m: Mean) -> str:
     """What tells a point from the others of its line, where the x axis does not."""
-    spec = parse_method(m.way.spec)
-    return spec.budget or (f"{m.way.fit:g} s" if m.way.fit else "")
+    return m.method.budget or (f"{m.method.fit_seconds:g} s" if m.method.fit_seconds else "")
 
 
 def on_frontier(means: list[Mean], cost: str, worth: str) -> list[Mean]:
-    """Those on the Pareto frontier, cheapest first; FLIP counts as better when it is less."""
+    """Those on the Pareto frontier, cheapest first."""
     means = [m for m in means if m.mean[cost] is not None]
-    sign = -1 if worth == "flip" else 1
+    sign = 1 if METRICS[worth].higher_is_better else -1
     return [means[i] for i in frontier([m.mean[cost] for m in means], [sign * m.mean[worth] for m in means])]
 
 
@@ -163,12 +171,12 @@ def key(ax, means: list[Mean]) -> None:
     from matplotlib.lines import Line2D
 
     made, look = [], {"color": "#404040", "linestyle": "none", "markersize": 5}
-    for passes in (True, False):
-        if any(m.way.passes == passes for m in means):
-            mark, style = ("s", "-") if passes else ("o", ":")
-            made.append(Line2D([], [], marker=mark, label=f"sees {SEES[passes]}", **look))
+    for has_depth in (True, False):
+        if any(m.method.has_depth == has_depth for m in means):
+            mark, style = ("s", "-") if has_depth else ("o", ":")
+            made.append(Line2D([], [], marker=mark, label=f"sees {SEES[has_depth]}", **look))
             made.append(Line2D([], [], color="#606060", linestyle=style, label="its Pareto frontier"))
-    if any(m.way.baseline for m in means):
+    if any(m.method.baseline for m in means):
         made.append(Line2D([], [], marker="o", markerfacecolor="white", label="hollow: baselines", **look))
     legend = ax.legend(handles=made, fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=5, columnspacing=1)
     legend.set_in_layout(False)
@@ -179,7 +187,7 @@ def key(ax, means: list[Mean]) -> None:
 
 
 def budgets(rows: list[dict], centre: tuple[str, int]) -> dict[str, dict[str, list[tuple[float, float, bool]]]]:
-    """{way without a budget: {object: [(Gaussians, dB won over no budget, whether it is auto)] by size}}."""
+    """{method without a budget: {object: [(Gaussians, dB won over no budget, whether it is auto)] by size}}."""
     here = {(r["way"], r["object"]): r for r in rows if (r["setup"], r["size"]) == tuple(centre)}
     out: dict = {}
     for (label, name), r in here.items():
@@ -192,7 +200,7 @@ def budgets(rows: list[dict], centre: tuple[str, int]) -> dict[str, dict[str, li
 
 
 def draw_budgets(losses: dict):
-    """A panel for each way: what an object loses when it has fewer Gaussians; a star is what `auto` chose."""
+    """A panel for each method: what an object loses when it has fewer Gaussians; a star is what `auto` chose."""
     fig, axes = panels(len(losses), 5.6, 4.2)
     work = []
     for ax, (whole, curves) in zip(axes, losses.items(), strict=True):
@@ -221,8 +229,8 @@ def draw_inputs(means: list[Mean], setup: str, size: int):
     """PSNR and seconds over the number of views, and PSNR against seconds at sizes in pixels."""
     by_views = [m for m in means if m.size == size and (m.setup == setup or m.setup.startswith("views-"))]
     by_size = [m for m in means if m.setup == setup]
-    chosen = [w for w in dict.fromkeys(m.way.label for m in means) if any(
-        m.way.label == w and (m.setup, m.size) != (setup, size) for m in means)]  # fmt: skip
+    chosen = [w for w in dict.fromkeys(m.method.label for m in means) if any(
+        m.method.label == w and (m.setup, m.size) != (setup, size) for m in means)]  # fmt: skip
     plans = [("views", "psnr", by_views), ("views", "seconds", by_views), ("seconds", "psnr", by_size)]
     plans = [p for p in plans if len({(m.setup, m.size) for m in p[2]}) > 1]
     fig, axes = panels(len(plans), 4.6, 4.2)
@@ -230,18 +238,18 @@ def draw_inputs(means: list[Mean], setup: str, size: int):
     for ax, (x_name, y_name, part) in zip(axes, plans, strict=True):
         labels, hints, drawn = [], [], []
         for w in chosen:
-            line = sorted((m for m in part if m.way.label == w), key=lambda m: (m.views, m.size))
+            line = sorted((m for m in part if m.method.label == w), key=lambda m: (m.views, m.size))
             x = [m.views if x_name == "views" else m.mean["seconds"] for m in line]
-            y, way, colour = [m.mean[y_name] for m in line], line[0].way, FAMILIES[line[0].way.name]
+            y, method, colour = [m.mean[y_name] for m in line], line[0].method, FAMILIES[line[0].method.method]
             ax.plot(
-                x, y, color=colour, linewidth=1.2, marker="s" if way.passes else "o", markersize=4.5,
-                linestyle="--" if "refine" in w else "-", markerfacecolor="white" if way.baseline else colour,
+                x, y, color=colour, linewidth=1.2, marker="s" if method.has_depth else "o", markersize=4.5,
+                linestyle="--" if "refine" in w else "-", markerfacecolor="white" if method.baseline else colour,
             )  # fmt: skip
             labels.append((x[-1], y[-1], w, colour))
             hints += [(a, b, f"{m.size}²", colour) for a, b, m in zip(x, y, line, strict=True) if x_name != "views"]
             drawn.append((x, y))
         label = "input views" if x_name == "views" else "seconds of one thread (truth at the same size)"
-        ax.set(xscale="log", xlabel=label, ylabel=NAMES[y_name])
+        ax.set(xscale="log", xlabel=label, ylabel=axis_name(y_name))
         ax.set_yscale("log" if y_name == "seconds" else "linear")
         ax.margins(0.18, 0.1)
         plain(ax)
@@ -263,7 +271,7 @@ def write_renderer(path: Path, rows: list[dict], command: str) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(RENDERER)
     writer.writerows([[f"{r[k]:.5g}" if isinstance(r[k], float) else r[k] for k in RENDERER] for r in rows])
-    replace(path, text.getvalue().encode())
+    write_whole(path, text.getvalue().encode())
 
 
 def draw_renderer(path: Path) -> str:
@@ -303,7 +311,7 @@ def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, 
     machine, versions = facts["machine"], facts["versions"]
     names = list(dict.fromkeys(r["object"] for r in rows))
     most = max(m.count for m in means)
-    short = sorted({r["way"] for r in rows} - {m.way.label for m in means})
+    short = sorted({r["way"] for r in rows} - {m.method.label for m in means})
     seen = f"the setup `{setup}`" if setup else "all views that are not held out"
     what = [
         f"{most} objects ({', '.join(names)}); centre: {seen}, {size}x{size} pixels; scored on held-out views.",
@@ -326,12 +334,12 @@ def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, 
     others = [m for m in means if m not in centre]
     parts += ["## At the centre", table(centre)] + (["## Other inputs and sizes", table(others)] if others else [])
     parts.append(
-        "± is the standard error over objects. Gain: PSNR against the way at the centre that sees the same (`guided`, "
-        "or `rgb`), object by object, with the standard error of that difference; these are the bars in the pictures. "
-        "Seconds: from views in memory to Gaussians, of one thread. FLIP: less is better. Gaussians: those that the "
-        "paper's inference filters keep. No megabytes where a scene is no 4D Gaussians. Drawing: milliseconds a view "
-        "at this size. Coverage: what share of the object the input views show, by the way's own Gaussians "
-        "(`model.coverage`). +dense: tokens of the network everywhere, not only where the object is."
+        "± is the standard error over objects. Gain: PSNR against the method at the centre that sees the same "
+        "(`guided`, or `rgb`), object by object, with the standard error of that difference; these are the bars in "
+        "the pictures. Seconds: from views in memory to Gaussians, of one thread. FLIP: less is better. Gaussians: "
+        "those that the paper's inference filters keep. No megabytes where a scene is no 4D Gaussians. Drawing: "
+        "milliseconds a view at this size. Coverage: what share of the object the input views show, by the method's "
+        "own Gaussians (`model.coverage`). +dense: tokens of the network everywhere, not only where the object is."
     )
     return "\n\n".join(filter(None, parts)) + "\n"
 
@@ -339,24 +347,29 @@ def page(means: list[Mean], centre: list[Mean], rows: list[dict], command: str, 
 def frontiers(centre: list[Mean]) -> str:
     """A Markdown table of what is on each frontier, and which of it are baselines."""
     lines = ["| frontier | among ways that see | on it, cheapest first | baselines on it |", "|---|---|---|---|"]
-    for worth, cost in (("psnr", "seconds"), ("flip", "seconds"), ("psnr", "gaussians"), ("psnr", "usd_mb")):
+    pairs = [(k, "seconds") for k in charted(centre)] + [("psnr", "gaussians"), ("psnr", "usd_mb")]
+    for worth, cost in pairs:
         if not any(m.mean[cost] for m in centre):
             continue
         for sees in (True, False, None):
-            group = [m for m in centre if sees is None or m.way.passes == sees]
-            if not group or (sees is None and len({m.way.passes for m in centre}) == 1):
+            group = [m for m in centre if sees is None or m.method.has_depth == sees]
+            if not group or (sees is None and len({m.method.has_depth for m in centre}) == 1):
                 continue
             best = on_frontier(group, cost, worth)
-            base = ", ".join(m.way.label for m in best if m.way.baseline) or "none"
-            cells = [f"{worth.upper()} / {NAMES[cost]}", "either" if sees is None else SEES[sees]]
-            lines.append("| " + " | ".join([*cells, ", ".join(m.way.label for m in best), base]) + " |")
+            base = ", ".join(m.method.label for m in best if m.method.baseline) or "none"
+            cells = [f"{METRICS[worth].title} / {NAMES[cost]}", "either" if sees is None else SEES[sees]]
+            lines.append("| " + " | ".join([*cells, ", ".join(m.method.label for m in best), base]) + " |")
     return "\n".join(lines)
 
 
 def table(means: list[Mean]) -> str:
-    digits = dict(zip(FIGURES, (2, 2, 2, 3, 3, 0, 2, 2, 1, 2), strict=True))
-    heads = ["way", "sees", "views", "size", "seconds", "PSNR", "gain", "PSNR fg", "SSIM", "FLIP", "Gaussians"]
-    heads += [".ply MB", ".usdc MB", "drawing ms", "coverage"]
+    digits = {k: m.digits for k, m in METRICS.items()}
+    digits |= {"seconds": 2, "gaussians": 0, "ply_mb": 2, "usd_mb": 2, "render_ms": 1, "coverage": 2}
+    titles = {"seconds": "seconds", "gaussians": "Gaussians", "ply_mb": ".ply MB", "usd_mb": ".usdc MB"}
+    titles |= {"render_ms": "drawing ms", "coverage": "coverage"} | {k: m.title for k, m in METRICS.items()}
+    known = [k for k in FIGURES if k not in METRICS or any(m.mean[k] is not None for m in means)]
+    heads = ["method", "sees", "views", "size"]
+    heads += [x for k in known for x in ([titles[k], "gain"] if k == "psnr" else [titles[k]])]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
 
     def cell(value: float | None, error: float, n: int, signed: bool = False) -> str:
@@ -365,9 +378,10 @@ def table(means: list[Mean]) -> str:
         return f"{value:{'+' if signed else ''}.{n}f}" + (f" ± {error:.{n}f}" if error else "")
 
     for m in means:
-        figures = {k: cell(m.mean[k], m.error[k] if k in ("psnr", "flip") else 0, digits[k]) for k in FIGURES}
-        gain = cell(m.gain.get("psnr"), m.gain_error.get("psnr", 0), 2, True)
-        first = [m.way.label, SEES[m.way.passes], str(m.views), str(m.size), figures["seconds"], figures["psnr"]]
-        last = [figures[k] for k in FIGURES[2:]]
-        lines.append("| " + " | ".join([*first, gain, *last]) + " |")
+        line = [m.method.label, SEES[m.method.has_depth], str(m.views), str(m.size)]
+        for k in known:
+            line.append(cell(m.mean[k], m.error[k] if k in charted(means) else 0, digits[k]))
+            if k == "psnr":
+                line.append(cell(m.gain.get(k), m.gain_error.get(k, 0), 2, True))
+        lines.append("| " + " | ".join(line) + " |")
     return "\n".join(lines)

@@ -17,11 +17,11 @@ import torch
 
 from ..datagen.sequence import InputError, Sequence, read_sequence
 from ..model.views import load_views
-from .figures import replace
+from .figures import write_whole
 from .pictures import grid
 
 
-def sheet(seq: Sequence, frames: int):
+def contact_sheet(seq: Sequence, frames: int):
     """-> PIL image: a row a camera, `frames` columns evenly spread over the clip."""
     chosen = np.unique(np.linspace(seq.frame_start, seq.frame_end, frames).round().astype(int))
     cameras: dict[str, dict[int, int]] = {}
@@ -78,8 +78,8 @@ def main(argv: list[str] | None = None) -> int:
     args = p.parse_args(argv)
     try:
         data = io.BytesIO()
-        sheet(read_sequence(args.sequence), args.frames).save(data, "PNG", optimize=True)
-        replace(args.out, data.getvalue())
+        contact_sheet(read_sequence(args.sequence), args.frames).save(data, "PNG", optimize=True)
+        write_whole(args.out, data.getvalue())
     except InputError as e:
         print(f"timesplat: {e}", file=sys.stderr)
         return 2

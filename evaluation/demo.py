@@ -6,64 +6,87 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-
-import torch
-from tqdm import tqdm
-
-from ..datagen.render import Settings, render_shots
-from ..model.gaussians import Gaussians4D
-from ..model.io.asset import write_ply
-from ..model.io.usd_write import write_usd
-from ..model.reconstruct import clip_of
-from ..model.views import Views, load_views
-from .evaluate import draw, evaluate_method, warm_up
-from .pictures import grid, video
-from .tables import collect, table, write_metrics
 
 DEMO_SEED = 1_000_013  # a walking figure; checkpoints are trained on seeds below a million
 METHODS = ("white", "hull", "lift", "guided", "guided+budget:10%", "rgb")
 SHOWN = ("lift", "guided", "guided+budget:10%", "rgb")  # in pictures
-ASSET = "guided+budget:10%"  # the method whose Gaussians are exported
+EXPORTED = "guided+budget:10%"  # the method whose Gaussians are exported
 
 
-def run(args: argparse.Namespace, save_blend: Callable[[Path, Path], None]) -> int:
-    """args of `timesplat demo`; save_blend(ply, blend) writes the .blend. Returns 0, raises InputError."""
-    out = args.out
+@dataclass(frozen=True)
+class DemoOptions:
+    """What `timesplat demo` is asked for; see `add_arguments`."""
+
+    asset: str | None = None
+    out: Path = Path("out/demo")
+    size: int = 128
+    samples: int = 32
+    command: str = ""  # as it was typed, for the tables
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """The arguments of `timesplat demo`."""
+    d = DemoOptions()
+    p.add_argument(
+        "asset", nargs="?", help="an animated file, or zoo:SEED (default: a procedural object no checkpoint saw)"
+    )
+    p.add_argument("--out", type=Path, default=d.out, help="folder to write (default: %(default)s)")
+    p.add_argument("--size", type=int, default=d.size, help="pixels, a multiple of 8 (default: %(default)s)")
+    p.add_argument("--samples", type=int, default=d.samples, help="Cycles samples (default: %(default)s)")
+
+
+def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
+    """The command; save_blend(ply, blend) writes the .blend. Returns 0, raises InputError."""
+    from tqdm import tqdm
+
+    from ..datagen.render import Settings, render_shots
+    from ..model.io.asset import write_ply
+    from ..model.io.usd_write import write_usd
+    from ..model.reconstruct import clip_of
+    from . import protocol
+    from .cache import Cache
+    from .method_spec import parse_spec
+    from .provenance import Provenance
+    from .runner import Conditions, Run, key_of, run_all
+    from .tables import gather, table, write_metrics
+
+    out = options.out
     out.mkdir(parents=True, exist_ok=True)
     clock = time.perf_counter()
-    settings = Settings(targets=1, size=args.size, samples=args.samples)
+    settings = Settings(targets=1, size=options.size, samples=options.samples)
     with tqdm(desc="rendering", unit="image", total=0, disable=None) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total, bar.n = total, done
             bar.refresh()
 
-        seq = render_shots(args.asset or f"zoo:{DEMO_SEED}", out / "render", "demo", settings, progress=progress)
+        seq = render_shots(options.asset or f"zoo:{DEMO_SEED}", out / "render", "demo", settings, progress=progress)
     seconds = {"rendering": time.perf_counter() - clock}
-    targets, turn = seq.select(rig="target"), seq.select(rig="turntable")
-    inputs = [i for i, v in enumerate(seq.views) if v.rig not in ("target", "turntable")]
+    targets, turn = protocol.held_out(seq), seq.select(rig="turntable")
+    inputs = [i for i in protocol.all_inputs(seq) if seq.views[i].rig != "turntable"]
     print(f"{len(inputs)} input views, {len(targets)} held-out views, {len(turn)} turntable views")
 
-    warm_up(seq, inputs, METHODS)
-    rows, clouds = {}, {}
-    for method in METHODS:
-        rows[method], clouds[method] = evaluate_method(seq, method, inputs, targets)
-        seconds[method] = rows[method]["seconds"]
-        print(f"  {method}: {rows[method]['psnr']:.2f} dB in {seconds[method]:.1f} s")
+    name, cache, conditions = str(seq.provenance.get("asset", "demo")), Cache(out / "cache"), Conditions(scenes=True)
+    where = (tuple(inputs), tuple(targets), seq.width, {"setup": "", "stride": 1})
+    runs = [Run(name, seq.root, parse_spec(m), *where) for m in METHODS]
+    rows = run_all(runs, cache, conditions, "reconstructing")
+    scenes = {m: cache.scene(key_of(r, conditions)) for m, r in zip(METHODS, runs, strict=True)}
+    for row in rows:
+        seconds[row["method"]] = row["seconds"]
 
     clock = time.perf_counter()
-    asset = clouds[ASSET].to_asset(clip_of(seq))
+    asset = scenes[EXPORTED].to_asset(clip_of(seq))
     write_ply(out / "asset.ply", asset)
     write_usd(out / "asset.usdc", asset)
     save_blend(out / "asset.ply", out / "asset.blend")
     seconds["export"] = time.perf_counter() - clock
 
     clock = time.perf_counter()
-    _pictures(out, load_views(seq, targets), load_views(seq, turn), clouds, seq.fps)
+    _pictures(out, seq, targets, turn, scenes)
     seconds["pictures"] = time.perf_counter() - clock
-    name = str(seq.provenance.get("asset", "demo"))
-    metrics = collect({name: rows}) | {"seconds": seconds}
+    metrics = gather(rows, Provenance.of(options.command, [r.method.weights for r in runs])) | {"seconds": seconds}
     write_metrics(out, metrics)
     print(table(metrics))
     print("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in seconds.items()))
@@ -71,18 +94,24 @@ def run(args: argparse.Namespace, save_blend: Callable[[Path, Path], None]) -> i
     return 0
 
 
-def _pictures(out: Path, held_out: Views, turntable: Views, clouds: dict[str, Gaussians4D], fps: float) -> None:
+def _pictures(out: Path, seq, targets: list[int], turn: list[int], scenes: dict) -> None:
     """comparison.png: truth above each prediction, at six held-out views over time and six turntable views;
     turntable.webp: the same side by side while camera and time move."""
-    few = torch.linspace(0, len(held_out) - 1, 6).round().long()
-    some = torch.linspace(0, len(turntable) - 1, 7).round().long()[:6]
-    frames = [f"held out {round(float(t / held_out.frame_step) + 11.5)}" for t in held_out.time[few]]
-    around = [f"turntable {int(i)}" for i in some]
-    rows = {"truth": torch.cat([held_out[few].over(), turntable[some].over()])}
+    import torch
+
+    from ..model.views import load_views
+    from .pictures import grid, video
+    from .scoring import draw
+
+    held_out, turntable = load_views(seq, targets), load_views(seq, turn)
+    some_held_out = torch.linspace(0, len(held_out) - 1, 6).round().long()
+    around = torch.linspace(0, len(turntable) - 1, 7).round().long()[:6]
+    titles = [f"held out {round(float(t / held_out.frame_step) + 11.5)}" for t in held_out.time[some_held_out]]
+    titles += [f"turntable {int(i)}" for i in around]
+    rows = {"truth": torch.cat([held_out[some_held_out].over(), turntable[around].over()])}
     film = {"truth": turntable.over()}
     for method in SHOWN:
-        g = clouds[method]
-        film[method] = draw(g, turntable)[0]
-        rows[method] = torch.cat([draw(g, held_out[few])[0], film[method][some]])
-    grid(rows, frames + around).save(out / "comparison.png")
-    video(out / "turntable.webp", film, fps)
+        film[method] = draw(scenes[method], turntable)[0]
+        rows[method] = torch.cat([draw(scenes[method], held_out[some_held_out])[0], film[method][around]])
+    grid(rows, titles).save(out / "comparison.png")
+    video(out / "turntable.webp", film, seq.fps)

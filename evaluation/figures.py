@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .provenance import Provenance
+
 # Okabe and Ito's colours, which colour-blind people tell apart; the markers tell them apart in print.
 COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C8C8C"]
 MARKERS = "osD^vPX*"
@@ -26,7 +28,7 @@ def command_line(module: str, argv: Sequence[str] | None = None) -> str:
     return shlex.join(["python", "-m", module, *(sys.argv[1:] if argv is None else argv)])
 
 
-def replace(path: Path, data: bytes) -> Path:
+def write_whole(path: Path, data: bytes) -> Path:
     """Writes a file whole or not at all, and makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     tmp = path.with_name(f".{path.name}.tmp")
@@ -39,21 +41,35 @@ def replace(path: Path, data: bytes) -> Path:
 
 
 def write_table(
-    stem: Path, title: str, head: Sequence[str], rows: Sequence[Sequence], command: str, notes: Sequence[str] = ()
+    stem: Path,
+    title: str,
+    head: Sequence[str],
+    rows: Sequence[Sequence],
+    made_by: Provenance,
+    notes: Sequence[str] = (),
 ) -> str:
-    """`stem`.md (title, command, table, notes) and `stem`.csv (the command in a # line). Cells are strings as
-    they shall appear. Returns the Markdown."""
-    lines = [f"# {title}", "", f"`{command}`", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    """`stem`.md (title, command and code, table, notes) and `stem`.csv (command and code in # lines). Cells are strings
+    as they shall appear. Returns the Markdown."""
+    lines = [
+        f"# {title}",
+        "",
+        f"`{made_by.command}`",
+        "",
+        str(made_by),
+        "",
+        "| " + " | ".join(head) + " |",
+        "|---" * len(head) + "|",
+    ]
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
     lines += [x for note in notes for x in ("", note)]
     text = "\n".join(lines) + "\n"
     sheet = io.StringIO()
-    sheet.write(f"# {command}\n")
+    sheet.write(f"# {made_by.command}\n# {made_by}\n")
     writer = csv.writer(sheet, lineterminator="\n")
     writer.writerow(head)
     writer.writerows([[str(c).strip("*") for c in row] for row in rows])
-    replace(stem.with_name(stem.name + ".md"), text.encode())
-    replace(stem.with_name(stem.name + ".csv"), sheet.getvalue().encode())
+    write_whole(stem.with_name(stem.name + ".md"), text.encode())
+    write_whole(stem.with_name(stem.name + ".csv"), sheet.getvalue().encode())
     return text
 
 
@@ -83,27 +99,27 @@ def panels(count: int, width: float = 4.2, height: float = 3.3):
     return fig, list(axes[0])
 
 
-def save(fig, stem: Path, command: str) -> None:
-    """`stem`.svg and `stem`.png with the command in small print below."""
+def save(fig, stem: Path, caption: str) -> None:
+    """`stem`.svg and `stem`.png with the caption (the command, say) in small print below."""
     import textwrap
 
     import matplotlib.pyplot as plt
 
     width, height = fig.get_size_inches()
-    lines = textwrap.wrap(command, int(width * 19), break_long_words=True, break_on_hyphens=False)
+    lines = textwrap.wrap(caption, int(width * 19), break_long_words=True, break_on_hyphens=False)
     room = (0.14 * len(lines) + 0.06) / height
     fig.tight_layout(rect=(0, room, 1, 1))
     fig.text(0.06 / width, 0.04 / height, "\n".join(lines), fontsize=5.5, color="#707070", family="monospace")
     for kind in ("svg", "png"):
         data = io.BytesIO()
-        meta = {"Date": None, "Description": command} if kind == "svg" else {"Description": command}
+        meta = {"Date": None, "Description": caption} if kind == "svg" else {"Description": caption}
         fig.savefig(data, format=kind, dpi=160, metadata=meta)
-        replace(stem.with_name(f"{stem.name}.{kind}"), data.getvalue())
+        write_whole(stem.with_name(f"{stem.name}.{kind}"), data.getvalue())
     plt.close(fig)
 
 
-def save_picture(image, stem: Path, command: str) -> None:
-    """A PIL image as PNG with the command below it, and as SVG that holds the same picture."""
+def save_picture(image, stem: Path, caption: str) -> None:
+    """A PIL image as PNG with the caption below it, and as SVG that holds the same picture."""
     import base64
     import html
     import textwrap
@@ -112,18 +128,18 @@ def save_picture(image, stem: Path, command: str) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSansMono.ttf", 9)
-    lines = textwrap.wrap(command, max(image.width // 6, 40), break_long_words=True, break_on_hyphens=False)
+    lines = textwrap.wrap(caption, max(image.width // 6, 40), break_long_words=True, break_on_hyphens=False)
     sheet = Image.new("RGB", (image.width, image.height + 12 * len(lines) + 8), "white")
     sheet.paste(image, (0, 0))
     ImageDraw.Draw(sheet).text((4, image.height + 2), "\n".join(lines), fill="#707070", font=font)
     data = io.BytesIO()
     sheet.save(data, "PNG")
-    replace(stem.with_name(stem.name + ".png"), data.getvalue())
+    write_whole(stem.with_name(stem.name + ".png"), data.getvalue())
     inside = base64.b64encode(data.getvalue()).decode()
     svg = f'<svg xmlns="http://www.w3.org/2000/svg" width="{sheet.width}" height="{sheet.height}">'
-    svg += f"<desc>{html.escape(command)}</desc>"
+    svg += f"<desc>{html.escape(caption)}</desc>"
     svg += f'<image width="{sheet.width}" height="{sheet.height}" href="data:image/png;base64,{inside}"/></svg>\n'
-    replace(stem.with_name(stem.name + ".svg"), svg.encode())
+    write_whole(stem.with_name(stem.name + ".svg"), svg.encode())
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from .metrics import shown
+from .image_quality import shown
 
 PPD = 67.0  # pixels per degree of visual angle; the authors' default is 0.7 · 3840 / 0.7 · π / 180 = 67.02
 QC, QF = 0.7, 0.5  # exponents of the colour and of the feature difference

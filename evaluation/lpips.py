@@ -7,6 +7,7 @@ layers, `vgg.pth` of their package (lpips/weights/v0.1), named `lpips_vgg.pth`. 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -24,17 +25,11 @@ HINT = (
 
 
 class LPIPS:
-    """The distance with weights loaded. `LPIPS.find()` is None where a file is missing."""
+    """The distance with weights loaded; see `find_lpips`."""
 
     def __init__(self, vgg: VGG, weights: list[Tensor]):
         """weights: for each of LAYERS (C,), not negative."""
         self.vgg, self.weights = vgg, weights
-
-    @staticmethod
-    def find() -> LPIPS | None:
-        """From the files of `find_weights`. Raises InputError for a damaged one."""
-        features, linear = find_weights("vgg16"), find_weights("lpips_vgg")
-        return LPIPS(VGG(16).load(features), load_linear(linear)) if features and linear else None
 
     def __call__(self, image: Tensor, target: Tensor) -> Tensor:
         """image, target (V,H,W,3) sRGB, clamped to 0..1, 16 pixels a side or more -> (V,) distances."""
@@ -49,6 +44,18 @@ class LPIPS:
             unit = f / (f.square().sum(1, keepdim=True).sqrt() + 1e-10)
             total = total + ((unit[0] - unit[1]).square() * w[:, None, None]).sum(0).mean()
         return total
+
+
+def find_lpips() -> LPIPS | None:
+    """LPIPS from the files of `find_weights`, loaded once; None where one is missing. Raises InputError for a damaged
+    one."""
+    features, linear = find_weights("vgg16"), find_weights("lpips_vgg")
+    return _load(features, linear) if features and linear else None
+
+
+@lru_cache(maxsize=1)
+def _load(features: Path, linear: Path) -> LPIPS:
+    return LPIPS(VGG(16).load(features), load_linear(linear))
 
 
 def load_linear(path: Path) -> list[Tensor]:

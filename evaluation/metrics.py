@@ -1,90 +1,106 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How close pictures are: PSNR, foreground PSNR, SSIM. Images (…,H,W,3), values 0..1.
-
-Perceptual measures have files of their own, `flip` and `lpips`. Pictures of objects are mostly empty: what
-looks at a neighbourhood is computed where something is shown, and known without computing elsewhere.
-"""
+"""The registry of metrics: a new one is one entry of METRICS, and appears in tables, CSV, metrics.json and charts."""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass
 
-import torch
+import numpy as np
 from torch import Tensor
 
-WINDOW = 11  # pixels a side of SSIM's window
-STEP = 16  # crops grow to multiples of this, so that few filter matrices are needed
+from .flip import flip
+from .image_quality import psnr, psnr_foreground, ssim
+from .loading import Truth
+from .lpips import find_lpips
+
+ALL, NOVEL = "", "novel_"  # prefixes of columns: over all views scored; over those alone that no input shows
 
 
-def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """(…) dB per image, on [0,1]; predictions are clamped to it, as an 8-bit file would be."""
-    mse = (image.clamp(0, 1) - target).square().mean((-3, -2, -1))
-    return -10 * torch.log10(mse.clamp_min(1e-10))
+@dataclass
+class Pictures:
+    """What a metric sees: predictions of all views, and what they should be."""
+
+    rgb: Tensor  # (V,H,W,3) over white
+    alpha: Tensor  # (V,H,W)
+    truth: Truth  # of the same V views
 
 
-def psnr_foreground(image: Tensor, target: Tensor, alpha: Tensor, target_alpha: Tensor) -> Tensor:
-    """(…) dB over the pixels (…,H,W) where either picture shows the object (alpha above 1/255): a white
-    background flatters nobody here, and stray Gaussians outside of the object count."""
-    mask = (torch.maximum(alpha, target_alpha) > 1 / 255).float()
-    error = (image.clamp(0, 1) - target).square().mean(-1) * mask
-    mse = error.sum((-2, -1)) / mask.sum((-2, -1)).clamp_min(1)
-    return -10 * torch.log10(mse.clamp_min(1e-10))
+@dataclass(frozen=True)
+class Metric:
+    """A figure of every view."""
+
+    key: str  # its name in files
+    title: str  # of a column in tables
+    axis: str  # of an axis in charts
+    digits: int  # decimals in tables
+    measure: Callable[[Pictures], list[float | None]]  # a figure per view, None where there is none
+    higher_is_better: bool = True
+    spread: tuple[str, ...] = ()  # ALL, NOVEL: where 5th percentile and worst view are told besides the mean
+    charted: bool = True  # has a panel in charts
+    novel_only: bool = False  # of views that no input shows, alone, as it is dear
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """(…) structural similarity: Gaussian window of 11 pixels, σ 1.5, data range 1 (Wang et al. 2004), over
-    the pixels whose window lies inside; colour channels averaged. Images of 11 pixels a side or more.
-
-    Where both are white the index is 1: windows that reach nothing else are counted, not computed."""
-    height, width = image.shape[-3:-1]
-    windows = (height - WINDOW + 1) * (width - WINDOW + 1)
-    scores = []
-    for x, y in zip(image.reshape(-1, height, width, 3), target.reshape(-1, height, width, 3), strict=True):
-        rows, columns = shown(x, y, WINDOW - 1)
-        if rows.stop == 0:
-            scores.append(x.new_ones(()))
-            continue
-        inside = _ssim(x[rows, columns].clamp(0, 1).movedim(-1, 0), y[rows, columns].clamp(0, 1).movedim(-1, 0))
-        scores.append(1 - (1 - inside).sum((-2, -1)).mean() / windows)
-    return torch.stack(scores).reshape(image.shape[:-3])
+def _lpips(p: Pictures) -> list[float | None]:
+    distance = find_lpips()
+    return distance(p.rgb, p.truth.picture).tolist() if distance else [None] * len(p.rgb)
 
 
-def _ssim(x: Tensor, y: Tensor) -> Tensor:
-    """x, y (C,H,W) -> (C,H-10,W-10) the index of each window."""
-    height, width = x.shape[-2:]
-    w = torch.exp(-0.5 * ((torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2) / 1.5) ** 2)
-    w = tuple((w / w.sum()).tolist())
-    maps = torch.stack([x, y, x * x, y * y, x * y])
-    maps = valid(w, height).to(x) @ maps @ valid(w, width).to(x).T
-    mx, my, xx, yy, xy = maps
-    vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    return (2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+def _flip(p: Pictures) -> list[float | None]:
+    novel = p.truth.novel.nonzero()[:, 0].tolist()
+    found: dict[int, float] = {}
+    if novel:
+        errors = flip(p.rgb[novel], p.truth.picture[novel], [p.truth.features(i) for i in novel])
+        found = dict(zip(novel, errors.tolist(), strict=True))
+    return [found.get(i) for i in range(len(p.rgb))]
 
 
-@lru_cache(maxsize=64)
-def valid(kernel: tuple[float, ...], size: int) -> Tensor:
-    """(size - taps + 1, size) float64: correlation with a kernel as a matrix, where the kernel lies inside. One
-    product with it is faster than torch's convolution of single channels."""
-    out = torch.zeros(size - len(kernel) + 1, size, dtype=torch.float64)
-    for i, k in enumerate(kernel):
-        out.diagonal(i).fill_(k)
-    return out
+METRICS = {
+    m.key: m
+    for m in (
+        Metric("psnr", "PSNR", "PSNR (dB)", 2, lambda p: psnr(p.rgb, p.truth.picture).tolist(), spread=(ALL, NOVEL)),
+        Metric(
+            "psnr_fg", "PSNR fg", "PSNR fg (dB)", 2,
+            lambda p: psnr_foreground(p.rgb, p.truth.picture, p.alpha, p.truth.views.alpha).tolist(),
+            spread=(ALL,), charted=False,
+        ),
+        Metric("ssim", "SSIM", "SSIM", 3, lambda p: ssim(p.rgb, p.truth.picture).tolist()),
+        Metric("lpips", "LPIPS", "LPIPS", 3, _lpips, higher_is_better=False),
+        Metric("flip", "FLIP", "FLIP", 3, _flip, higher_is_better=False, novel_only=True),
+    )
+}  # fmt: skip
 
 
-def shown(x: Tensor, y: Tensor, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the box around all pixels of two pictures (H,W,3) where either is not white, `margin`
-    pixels wider on every side, as far as there are any; its sides are multiples of STEP or the whole picture.
-    Empty slices where both are white."""
-    ink = (x < 1).any(-1) | (y < 1).any(-1)
-    return tuple(_span(ink.any(axis), margin) for axis in (1, 0))
+def measure(pictures: Pictures, left_out: tuple[str, ...] = ()) -> dict[str, list]:
+    """{metric: a figure per view, None where there is none or it is `left_out`}, and `novel`: whether no input shows
+    the view. Six decimals."""
+    nothing = [None] * len(pictures.rgb)
+    frames = {k: nothing if k in left_out else m.measure(pictures) for k, m in METRICS.items()}
+    frames["novel"] = pictures.truth.novel.tolist()
+    return {k: [round(x, 6) if isinstance(x, float) else x for x in v] for k, v in frames.items()}
 
 
-def _span(ink: Tensor, margin: int) -> slice:
-    where = ink.nonzero()
-    if not len(where):
-        return slice(0, 0)
-    first, last = max(int(where[0]) - margin, 0), min(int(where[-1]) + 1 + margin, len(ink))
-    length = min(-(-(last - first) // STEP) * STEP, len(ink))
-    first = min(first, len(ink) - length)
-    return slice(first, first + length)
+def _columns(prefix: str, m: Metric) -> list[str]:
+    names = [m.key if m.novel_only else prefix + m.key]
+    return names + ([f"{prefix}{m.key}_p5", f"{prefix}{m.key}_worst"] if prefix in m.spread else [])
+
+
+COLUMNS = [c for m in METRICS.values() if not m.novel_only for c in _columns(ALL, m)]
+COLUMNS += [c for m in METRICS.values() for c in _columns(NOVEL, m)]
+
+
+def summarise(frames: dict[str, list]) -> dict[str, float | None]:
+    """What `measure` gave, of the views of one object or of several -> COLUMNS: means, and 5th percentile and worst
+    view; of all views and of the novel ones. None where there is nothing to average."""
+    out: dict[str, float | None] = {}
+    for prefix, keep in ((ALL, [True] * len(frames["novel"])), (NOVEL, frames["novel"])):
+        for m in METRICS.values():
+            known = [x for x, kept in zip(frames[m.key], keep, strict=True) if kept and x is not None]
+            figures = [float(np.mean(known)) if known else None]
+            if prefix in m.spread:
+                worst = min if m.higher_is_better else max
+                bad = float(np.percentile(known, 5 if m.higher_is_better else 95)) if known else None
+                figures += [bad, worst(known, default=None)]
+            if prefix == NOVEL or not m.novel_only:
+                out |= dict(zip(_columns(prefix, m), figures, strict=True))
+    return {k: out[k] for k in COLUMNS}

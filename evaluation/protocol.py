@@ -23,6 +23,7 @@ from ..datagen.sequence import InputError, Sequence
 TABLE = ("alternating", "interpolation", "rotating", "random")  # the columns of the paper's two main tables
 FIXED = (*TABLE, "video", "canonical")
 FORMS = f"{', '.join(FIXED)}, random-N (N of 1 to 4 a frame) or views-N (N of 1 to 4 times the frames, in all)"
+RENDER = "render it with `timesplat render --rig evaluation --targets 1`"
 EXACT = 1e-4  # cameras closer than this are the same
 
 
@@ -63,6 +64,36 @@ def inputs(seq: Sequence, setup: str) -> list[int]:
             "render it with --rig evaluation --targets 1."
         )
     return [place[w] for w in wanted]
+
+
+def all_inputs(seq: Sequence) -> list[int]:
+    """All views that are not held out."""
+    return [i for i, v in enumerate(seq.views) if v.rig != "target"]
+
+
+def held_out(seq: Sequence) -> list[int]:
+    """The held-out views (rig "target"). Raises InputError where there are none."""
+    found = seq.select(rig="target")
+    if not found:
+        raise InputError(f"{seq.root}: no held-out views to score; {RENDER}.")
+    return found
+
+
+def every_nth(seq: Sequence, step: int) -> list[int]:
+    """One canonical view at every `step`-th frame: front, left, back, right in turn. Raises InputError."""
+    frames = range(seq.frame_start, seq.frame_end + 1, step)
+    found = [seq.select(frame=f, camera=list(rigs.CANONICAL)[n % 4], rig="canonical") for n, f in enumerate(frames)]
+    if lacking := [f for f, x in zip(frames, found, strict=True) if not x]:
+        raise InputError(f"{seq.root}: frame {lacking[0]} lacks a canonical view; {RENDER}.")
+    return [x[0] for x in found]
+
+
+def at_frame(seq: Sequence, frame: int, *names: str) -> list[int]:
+    """All views of the rigs `names` at a frame. Raises InputError where there are none."""
+    found = [i for name in names for i in seq.select(rig=name, frame=frame)]
+    if not found:
+        raise InputError(f"{seq.root}: frame {frame} has no view of the rigs {', '.join(names)}; {RENDER}.")
+    return found
 
 
 def spread(frames, count: int) -> list[tuple[int, int]]:

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a figure comes from: the command, the revision of the code, and the weights that it was made with."""
+"""Where a figure comes from: the command, the revision of the code, the weights, the machine and its packages."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import platform
 import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -25,14 +27,19 @@ class Provenance:
     checkpoints: dict[str, str] = field(default_factory=dict)  # file name -> first 12 digits of its SHA-256
 
     @staticmethod
-    def of(command: str, checkpoints: Iterable[Path] = ()) -> Provenance:
-        """For this command and the code that runs; checkpoints that are no files are left out."""
+    def of(command: str, checkpoints: Iterable[Path | None] = ()) -> Provenance:
+        """For this command and the code that runs; checkpoints that are None or no files are left out."""
         try:
             installed = version("timesplat")
         except PackageNotFoundError:
             installed = None
-        hashes = {p.name: file_hash(p) for p in sorted(set(checkpoints)) if p.is_file()}
+        hashes = {p.name: file_hash(p) for p in sorted({p for p in checkpoints if p}) if p.is_file()}
         return Provenance(command, installed, *revision(ROOT), hashes)
+
+    @property
+    def caption(self) -> str:
+        """Command and code, as pictures have them in small print."""
+        return f"{self.command} ({self})"
 
     def __str__(self) -> str:
         """The line below the command."""
@@ -59,7 +66,39 @@ def revision(folder: Path) -> tuple[str | None, bool | None]:
         return None, None
 
 
-@cache
 def file_hash(path: Path) -> str:
     """The first 12 hexadecimal digits of a file's SHA-256."""
+    about = path.stat()
+    return _hash(path, about.st_mtime_ns, about.st_size)
+
+
+@lru_cache(maxsize=256)
+def _hash(path: Path, changed: int, size: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def machine() -> dict:
+    """What the figures were taken on: processor, cores that may be used, system."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [x.split(":", 1)[1].strip() for x in cpuinfo.read_text().splitlines() if x.startswith("model name")]
+        name = names[0] if names else name
+    return {"cpu": name, "cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
+
+
+def usable_cores() -> int:
+    """How many processor cores this process may use; of the whole machine where the system does not say (macOS and
+    Windows)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def versions() -> dict:
+    """Versions of what has a say in the figures."""
+    out = {"python": platform.python_version()}
+    for package in ("timesplat", "torch", "numpy", "numba", "bpy", "usd-core"):
+        try:
+            out[package] = version(package)
+        except PackageNotFoundError:
+            out[package] = None
+    return out

@@ -11,8 +11,8 @@
   pictures       rows of methods, columns of frames
 
 Objects are Sequences below the folders given, rendered with `timesplat render --rig evaluation --targets 1`.
-Methods are written [LABEL=]METHOD[@CHECKPOINT], with commas between. Figures come as SVG and PNG, tables as
-Markdown and CSV, each with its command. Scores are kept in OUT/scores.json: an interrupted study goes on.
+Methods are written as method_spec.py says, with commas between. Figures come as SVG and PNG, tables as
+Markdown and CSV, each with its command. Scores are kept in OUT/rows.jsonl: an interrupted study goes on.
 """
 
 from __future__ import annotations
@@ -20,16 +20,43 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from ..datagen.sequence import InputError
+from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
 from . import paper, protocol
 from .ablations import RUNS, read_log
+from .cache import Cache, name_sequences
 from .figures import COLOURS, band, command_line, panels, save, save_picture, smooth, write_table
-from .subjects import METRICS, RENDER, Scores, Subject, at_frame, every, methods, reconstruct, subjects
+from .loading import load_inputs, load_truth
+from .method_spec import FORM, MethodSpec, parse_specs
+from .metrics import METRICS
+from .pictures import grid
+from .provenance import Provenance
+from .runner import Conditions, Run, run_all
+from .scoring import draw, reconstruct
+
+
+@dataclass
+class StudyOptions:
+    """What a study is made of; each uses its part of it."""
+
+    out: Path
+    made_by: Provenance
+    subjects: dict[str, Sequence]  # by name
+    methods: list[MethodSpec]
+    size: int = 128  # pixels
+    jobs: int = 1
+    device: str = "cpu"
+    counts: tuple[int, ...] = ()  # of input views
+    every: int = 4  # every N-th frame
+    setup: str = "alternating"
+    columns: int = 6  # frames to show
+    runs: tuple[str, ...] = ()  # NAME=FOLDER
+    window: int = 5  # reports that curves are averaged over
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -41,16 +68,27 @@ def main(argv: list[str] | None = None) -> int:
         sub.add_argument("--out", type=Path, default=Path("out/studies"), help="folder (default: out/studies)")
         if default:
             sub.add_argument("folders", nargs="+", type=Path, metavar="SEQUENCES", help="folders of Sequences")
-            sub.add_argument("--methods", default=default, help=f"[LABEL=]METHOD[@CHECKPOINT],… (default: {default})")
+            about = f"comma-separated {FORM} (default: {default})".replace("%", "%%")
+            sub.add_argument("--methods", default=default, help=about)
             sub.add_argument("--size", type=int, default=128, help="pixels, by averaging (default: 128)")
+            sub.add_argument("--jobs", type=int, default=1, help="processes, one core each (default: 1)")
+            sub.add_argument("--device", default="cpu", help="where methods run: cpu or cuda (default: cpu)")
         for words, options in arguments:
             sub.add_argument(words, **options)
     args = p.parse_args(argv)
+    run, default = args.run, STUDIES[args.study][2]
     try:
-        if args.study != "training":
-            args.methods = methods(args.methods)
-            args.subjects = subjects(args.folders, args.size)
-        args.run(args, command_line("timesplat.evaluation.studies", argv))
+        methods = parse_specs(args.methods, seconds=10.0) if default else []
+        options = StudyOptions(
+            out=args.out,
+            made_by=Provenance.of(command_line("timesplat.evaluation.studies", argv), [m.weights for m in methods]),
+            subjects=subjects(args.folders, args.size) if default else {},
+            methods=methods,
+        )
+        for f in fields(options):  # each study has its own arguments
+            if f.name not in ("made_by", "subjects", "methods") and hasattr(args, f.name):
+                setattr(options, f.name, getattr(args, f.name))
+        run(options)
     except InputError as e:
         print(f"studies: {e}", file=sys.stderr)
         return 2
@@ -72,36 +110,64 @@ def numbers(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"{text}: whole numbers with commas between, please") from None
 
 
-def scored(args, study: str, conditions: list, choose: Callable, targets: Callable, **how) -> dict:
-    """Every method on every object in every condition -> {(condition, label): [scores per object]}.
-    choose(subject, condition) and targets(subject, condition) give indices of views, or a list of such lists
-    (moments, each reconstructed alone, whose scores are joined) with `still`. how: see `score`."""
-    scores = Scores(args.out / "scores.json")
-    plan = [(s, c, choose(s, c), targets(s, c)) for s in args.subjects for c in conditions]  # bad input shows at once
-    out: dict = {}
-    bar = tqdm(total=len(plan) * len(args.methods), desc=study, unit="run", disable=None)
-    for s, c, inputs, held_out in plan:
-        for m in args.methods:
-            bar.set_postfix_str(f"{s.name} {m.label} {c}")
-            parts = zip(inputs, held_out, strict=True) if how.get("still") else [(inputs, held_out)]
-            rows = [scores.of(study, s, m, i, t, **how) for i, t in parts]
-            out.setdefault((c, m.label), []).append({k: [x for r in rows for x in r[k]] for k in METRICS})
-            bar.update()
-    bar.close()
+def subjects(folders: list[Path], size: int) -> dict[str, Sequence]:
+    """Every Sequence below the folders by name. Raises InputError where there is none, or one cannot be shrunk."""
+    found = sorted({p for f in folders for p in sequences_in(f)})
+    if not found:
+        raise InputError(f"{folders[0]}: no Sequence in it; {protocol.RENDER}.")
+    out = {n: read_sequence(f) for n, f in name_sequences(found).items()}
+    for seq in out.values():
+        if seq.width != seq.height or size < 1 or seq.width % size:
+            raise InputError(f"{seq.root}: {seq.width}x{seq.height} pixels cannot be shrunk to {size}; choose --size.")
     return out
 
 
-def paper_views(s: Subject, _=None) -> list[int]:
+def scored(
+    options: StudyOptions, study: str, conditions: list, inputs: Callable, targets: Callable, step: int = 1
+) -> dict:
+    """Every method on every object in every condition -> {(condition, label): [scores per object]}.
+    inputs(seq, condition) and targets(seq, condition) give indices of views. step: the inputs are of every step-th
+    frame."""
+
+    def parts(seq: Sequence, c) -> list[tuple]:
+        return [(inputs(seq, c), targets(seq, c))]
+
+    return scored_parts(options, study, conditions, parts, step=step)
+
+
+def scored_parts(options: StudyOptions, study: str, conditions: list, parts: Callable, **how) -> dict:
+    """The same where parts(seq, condition) gives [(inputs, targets)], each reconstructed alone, whose scores are
+    joined. how: `still` or `step` of a Run."""
+    labels: list[tuple] = []
+    runs = []
+    for name, seq in options.subjects.items():
+        for c in conditions:
+            for chosen, held_out in parts(seq, c):  # bad input shows at once
+                for m in options.methods:
+                    labels.append((c, m.label, name))
+                    runs.append(
+                        Run(name, seq.root, m, tuple(chosen), tuple(held_out), options.size, {"study": study}, **how)
+                    )
+    rows = run_all(runs, Cache(options.out), Conditions(jobs=options.jobs, device=options.device), study)
+    joined: dict[tuple, dict[str, list]] = {}
+    for at, row in zip(labels, rows, strict=True):
+        frames = joined.setdefault(at, {k: [] for k in METRICS})
+        for k in METRICS:
+            frames[k] += row["frames"][k]
+    out: dict = {}
+    for (c, label, _), frames in joined.items():
+        out.setdefault((c, label), []).append(frames)
+    return out
+
+
+def paper_views(seq: Sequence, _=None) -> list[int]:
     """What the paper scores: the four canonical views and a random one at every frame."""
-    return protocol.targets(s.seq)
+    return protocol.targets(seq)
 
 
-def novel_views(s: Subject, _=None) -> list[int]:
+def novel_views(seq: Sequence, _=None) -> list[int]:
     """One novel random view at every frame."""
-    found = s.seq.select(rig="target")
-    if not found:
-        raise InputError(f"{s.seq.root}: no held-out views to score; {RENDER}.")
-    return found
+    return protocol.held_out(seq)
 
 
 def per_object(rows: list[dict], metric: str) -> np.ndarray:
@@ -113,38 +179,38 @@ def per_object(rows: list[dict], metric: str) -> np.ndarray:
 def cells(rows: list[dict]) -> list[str]:
     """Mean over objects ± standard error of each metric; – where there is none."""
     out = []
-    for k, (_, decimals) in METRICS.items():
+    for k, m in METRICS.items():
         x = per_object(rows, k)
-        error = f" ± {x.std(ddof=1) / len(x) ** 0.5:.{decimals}f}" if len(x) > 1 else ""
-        out.append("–" if np.isnan(x).any() else f"{x.mean():.{decimals}f}{error}")
+        error = f" ± {x.std(ddof=1) / len(x) ** 0.5:.{m.digits}f}" if len(x) > 1 else ""
+        out.append("–" if np.isnan(x).any() else f"{x.mean():.{m.digits}f}{error}")
     return out
 
 
 def printed(psnr: float, lpips: float, similarity: float) -> list[str]:
     """What the paper prints, in the columns of METRICS."""
     known = {"psnr": psnr, "lpips": lpips, "ssim": similarity}
-    return [f"{known[k]:.{decimals}f}" if k in known else "" for k, (_, decimals) in METRICS.items()]
+    return [f"{known[k]:.{m.digits}f}" if k in known else "" for k, m in METRICS.items()]
 
 
-def about(args, what: str) -> str:
-    names = [s.name for s in args.subjects]
+def about(options: StudyOptions, what: str) -> str:
+    names = list(options.subjects)
     return (
-        f"{what} Mean ± standard error over {len(names)} objects ({', '.join(names)}), {args.size}², over white; fg: "
-        "over the pixels that show the object."
+        f"{what} Mean ± standard error over {len(names)} objects ({', '.join(names)}), {options.size}², over white; "
+        "fg: over the pixels that show the object."
     )
 
 
-TITLES = [title for title, _ in METRICS.values()]
+TITLES = [m.axis for m in METRICS.values()]
 PAPERS = "Rows and columns marked as the paper's are what it prints: its data, its training, 256² unless said."
 
 
 # ---------------------------------------------------------------- studies
 
 
-def training(args, command: str) -> None:
+def training(options: StudyOptions) -> None:
     """Scaling of training: PSNR of the training samples against steps and CPU-seconds, of several runs."""
     runs = {}
-    for word in args.runs:
+    for word in options.runs:
         name, _, folders = word.rpartition("=")
         if name:
             runs[name] = [read_log(Path(f)) for f in folders.split("+")]
@@ -163,11 +229,11 @@ def training(args, command: str) -> None:
         look = {"color": COLOURS[n % len(COLOURS)], "linestyle": ["-", "--", ":"][n // len(COLOURS) % 3]}
         for ax, x in zip(axes, (step, spent), strict=True):
             ax.plot(x, psnr, linewidth=0.5, alpha=0.25, **look)
-            ax.plot(x, smooth(psnr, args.window), linewidth=1.6, label=name, **look)
+            ax.plot(x, smooth(psnr, options.window), linewidth=1.6, label=name, **look)
     axes[0].set(xlabel="training steps", ylabel="PSNR of training targets (dB)")
     axes[1].set(xlabel=seconds, ylabel="PSNR of training targets (dB)")
     axes[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    save(fig, args.out / "training", command)
+    save(fig, options.out / "training", options.made_by.caption)
 
 
 def comparisons(folder: Path) -> dict[str, list]:
@@ -182,119 +248,132 @@ def comparisons(folder: Path) -> dict[str, list]:
     return {p.parent.name: [read_log(f) for f in s] for p, s in zip(logs, stages, strict=True)}
 
 
-def views(args, command: str) -> None:
+def views(options: StudyOptions) -> None:
     """Scaling of inference: random views, spread over the clip; scored on four canonical and a random view a frame."""
-    result = scored(args, "views", args.counts, lambda s, n: protocol.inputs(s.seq, f"views-{n}"), paper_views)
-    labels = [m.label for m in args.methods]
+    result = scored(options, "views", options.counts, lambda seq, n: protocol.inputs(seq, f"views-{n}"), paper_views)
+    labels = [m.label for m in options.methods]
     known = [k for k in METRICS if not any(np.isnan(per_object(rows, k)).any() for rows in result.values())]
-    shown = [k for k in known if k != "psnr_fg"]
+    shown = [k for k in known if METRICS[k].charted]
     fig, axes = panels(len(shown))
     for ax, metric in zip(axes, shown, strict=True):
         for n, label in enumerate(labels):
-            curve = np.stack([per_object(result[c, label], metric) for c in args.counts], 1)
-            band(ax, args.counts, curve, label, n)
+            curve = np.stack([per_object(result[c, label], metric) for c in options.counts], 1)
+            band(ax, options.counts, curve, label, n)
         ax.set_xscale("log", base=2)
-        ax.set_xticks(args.counts, [str(c) for c in args.counts])
+        ax.set_xticks(options.counts, [str(c) for c in options.counts])
         ax.minorticks_off()
-        ax.set(xlabel="random input views", ylabel=METRICS[metric][0])
+        ax.set(xlabel="random input views", ylabel=METRICS[metric].axis)
     axes[0].legend()
-    save(fig, args.out / "views", command)
+    save(fig, options.out / "views", options.made_by.caption)
     head = ["method", "input views", *TITLES]
-    rows = [[label, c, *cells(result[c, label])] for label in labels for c in args.counts]
-    note = about(args, "Scored: the four canonical views and one random view at every frame.")
-    print(write_table(args.out / "views", "Scaling of inference", head, rows, command, [note]))
+    rows = [[label, c, *cells(result[c, label])] for label in labels for c in options.counts]
+    note = about(options, "Scored: the four canonical views and one random view at every frame.")
+    print(write_table(options.out / "views", "Scaling of inference", head, rows, options.made_by, [note]))
 
 
-def views_per_frame(args, command: str) -> None:
+def views_per_frame(options: StudyOptions) -> None:
     """One to four random views a frame and the four canonical ones; scored on one novel view a frame."""
     conditions = [("random", n) for n in (1, 2, 3, 4)] + [("canonical", 4)]
 
-    def choose(s: Subject, c) -> list[int]:
-        return protocol.inputs(s.seq, f"random-{c[1]}" if c[0] == "random" else "canonical")
+    def choose(seq: Sequence, c) -> list[int]:
+        return protocol.inputs(seq, f"random-{c[1]}" if c[0] == "random" else "canonical")
 
-    result = scored(args, "views-per-frame", conditions, choose, novel_views)
+    result = scored(options, "views-per-frame", conditions, choose, novel_views)
     head = ["inputs", "views a frame", "model", *TITLES]
     head += ["paper: Objaverse4D PSNR / SSIM", "Consistent4D PSNR / SSIM"]
     rows = []
     for c in conditions:
-        rows += [[*c, m.label, *cells(result[c, m.label]), "", ""] for m in args.methods]
+        rows += [[*c, m.label, *cells(result[c, m.label]), "", ""] for m in options.methods]
         for (*where, model), sets in paper.VIEWS_PER_FRAME.items():
             if tuple(where) == c:
                 rows.append([*c, f"paper's {model}", *[""] * len(METRICS), *(f"{p:.2f} / {s:.3f}" for p, _, s in sets)])
-    notes = [about(args, "Scored: one novel random view at every frame."), PAPERS]
-    print(write_table(args.out / "views-per-frame", "Views per frame", head, rows, command, notes))
+    notes = [about(options, "Scored: one novel random view at every frame."), PAPERS]
+    print(write_table(options.out / "views-per-frame", "Views per frame", head, rows, options.made_by, notes))
 
 
-def static(args, command: str) -> None:
+def static(options: StudyOptions) -> None:
     """Single moments: four canonical views of a frame with times set to 0, scored on novel views of it."""
 
-    def moments(*rigs: str):
-        return lambda s, _: [at_frame(s, f, *rigs) for f in s.frames[:: args.every]]
+    def moments(seq: Sequence, _) -> list[tuple]:
+        frames = range(seq.frame_start, seq.frame_end + 1, options.every)
+        rigs = ("canonical",), ("random", "target")
+        return [tuple(protocol.at_frame(seq, f, *r) for r in rigs) for f in frames]
 
-    result = scored(args, "static", [""], moments("canonical"), moments("random", "target"), still=True)
+    result = scored_parts(options, "static", [""], moments, still=True)
     head = ["model", "pixels", *TITLES]
-    rows = [[m.label, args.size, *cells(result["", m.label])] for m in args.methods]
+    rows = [[m.label, options.size, *cells(result["", m.label])] for m in options.methods]
     rows += [[f"paper: {model}, GSO", size, *printed(*x)] for (size, model), x in paper.STATIC.items()]
-    what = f"Every {args.every}th frame alone, from its four canonical views; scored: its five random views."
-    notes = [about(args, what), PAPERS]
-    print(write_table(args.out / "static", "Single moments, times collapsed to 0", head, rows, command, notes))
+    what = f"Every {options.every}th frame alone, from its four canonical views; scored: its five random views."
+    notes = [about(options, what), PAPERS]
+    print(
+        write_table(options.out / "static", "Single moments, times collapsed to 0", head, rows, options.made_by, notes)
+    )
 
 
-def video(args, command: str) -> None:
+def video(options: StudyOptions) -> None:
     """A video from the front with the four canonical views of its first frame; scored on all other views."""
 
-    def choose(s: Subject, _=None) -> list[int]:
-        return protocol.inputs(s.seq, "video")
+    def choose(seq: Sequence, _=None) -> list[int]:
+        return protocol.inputs(seq, "video")
 
-    result = scored(args, "video", [""], choose, lambda s, _: protocol.novel(s.seq, choose(s), protocol.targets(s.seq)))
-    rows = [[m.label, *cells(result["", m.label])] for m in args.methods]
+    def others(seq: Sequence, _) -> list[int]:
+        return protocol.novel(seq, choose(seq), protocol.targets(seq))
+
+    result = scored(options, "video", [""], choose, others)
+    rows = [[m.label, *cells(result["", m.label])] for m in options.methods]
     rows += [[f"paper: {model}, Consistent4D", *printed(*x)] for model, x in paper.VIDEO.items()]
     what = "Scored: the canonical views that are no input, and one random view, at every frame."
     note = "The first two of the paper's take the sides of frame 1 from a diffusion model, the last one true ones."
-    notes = [about(args, what), PAPERS, note]
-    print(write_table(args.out / "video", "Single-view video", ["model", *TITLES], rows, command, notes))
+    notes = [about(options, what), PAPERS, note]
+    print(write_table(options.out / "video", "Single-view video", ["model", *TITLES], rows, options.made_by, notes))
 
 
-def frame_rate(args, command: str) -> None:
+def frame_rate(options: StudyOptions) -> None:
     """Inputs at every 4th frame, one canonical view each; the frames between are scored against the truth."""
 
-    result = scored(args, "frame-rate", [""], lambda s, _: every(s, args.every), novel_views, step=args.every)
-    labels = [m.label for m in args.methods]
+    result = scored(
+        options, "frame-rate", [""], lambda seq, _: protocol.every_nth(seq, options.every), novel_views, options.every
+    )
+    labels = [m.label for m in options.methods]
     rows = []
     for label in labels:
         for seen in (True, False):
             parts = []
-            for s, r in zip(args.subjects, result["", label], strict=True):
-                first = s.seq.frame_start
-                here = [((s.seq.views[i].frame - first) % args.every == 0) == seen for i in novel_views(s)]
+            for seq, r in zip(options.subjects.values(), result["", label], strict=True):
+                first = seq.frame_start
+                here = [((seq.views[i].frame - first) % options.every == 0) == seen for i in novel_views(seq)]
                 parts.append({k: [x for x, h in zip(r[k], here, strict=True) if h] for k in METRICS})
             rows.append([label, "seen" if seen else "between", *cells(parts)])
     head = ["method", "times", *TITLES]
-    lengths = sorted({len(s.frames) for s in args.subjects})
-    what = (
-        f"Clips of {', '.join(map(str, lengths))} frames, one canonical view at every {args.every}th frame as input; "
-    )
-    what += "scored: one novel view at every frame."
-    title = f"Frame rate × {args.every}"
-    print(write_table(args.out / "frame-rate", title, head, rows, command, [about(args, what)]))
+    lengths = sorted({s.frame_end - s.frame_start + 1 for s in options.subjects.values()})
+    what = f"Clips of {', '.join(map(str, lengths))} frames, one canonical view at every {options.every}th frame as "
+    what += "input; scored: one novel view at every frame."
+    title = f"Frame rate × {options.every}"
+    print(write_table(options.out / "frame-rate", title, head, rows, options.made_by, [about(options, what)]))
 
 
-def lifetimes(args, command: str) -> None:
+def lifetimes(options: StudyOptions) -> None:
     """Where in time the Gaussians are and how long they live, with all frames seen and with every other one."""
-    for s in args.subjects:
-        for m in args.methods:
+    for name, seq in options.subjects.items():
+        frames = seq.frame_end - seq.frame_start + 1
+        for m in options.methods:
             fig, axes = panels(2, width=4.6)
             for n, setup in enumerate(("alternating", "interpolation")):
-                chosen = protocol.inputs(s.seq, setup)
-                g = reconstruct(s.views(chosen, m), m)
-                seen = len({s.seq.views[i].frame for i in chosen})
-                label = f"{setup} ({seen} of {len(s.frames)} frames)"
-                draw_lifetimes(axes, g, len(s.frames), label, n)
+                chosen = protocol.inputs(seq, setup)
+                g = scene_of(options, seq, chosen, m)
+                seen = len({seq.views[i].frame for i in chosen})
+                draw_lifetimes(axes, g, frames, f"{setup} ({seen} of {frames} frames)", n)
             axes[0].set(xlabel="$\\mu_t$ (frame)", ylabel="share of Gaussians")
             axes[1].set(xlabel="$\\sigma_t$ (frames)", ylabel="share of Gaussians")
             for ax in axes:
-                ax.legend(fontsize=7.5, loc="lower left", bbox_to_anchor=(0, 1), title=f"{s.name}, {m.label}")
-            save(fig, args.out / f"lifetimes-{s.name.replace('/', '-')}-{m.label}", command)
+                ax.legend(fontsize=7.5, loc="lower left", bbox_to_anchor=(0, 1), title=f"{name}, {m.label}")
+            save(fig, options.out / f"lifetimes-{name.replace('/', '-')}-{m.label}", options.made_by.caption)
+
+
+def scene_of(options: StudyOptions, seq: Sequence, chosen: list[int], method: MethodSpec):
+    """The scene that a method makes of some views, without what the inference filters would never draw."""
+    scene = reconstruct(load_inputs(seq, chosen, method.has_depth, options.size), method, options.device)
+    return scene[scene.alive()]
 
 
 def draw_lifetimes(axes, g, frames: int, label: str, n: int) -> None:
@@ -315,20 +394,18 @@ def draw_lifetimes(axes, g, frames: int, label: str, n: int) -> None:
         ax.hist(x, edges, weights=weight, label=text, **edge)
 
 
-def pictures(args, command: str) -> None:
+def pictures(options: StudyOptions) -> None:
     """Truth and methods side by side from novel views at some frames, inputs of one of the setups."""
-    from .evaluate import draw
-    from .pictures import grid
-
-    for s in args.subjects:
-        chosen, held_out = protocol.inputs(s.seq, args.setup), novel_views(s)
-        shown = [held_out[i] for i in np.linspace(0, len(held_out) - 1, args.columns).round().astype(int)]
-        truth = s.truth(chosen, shown)
+    for name, seq in options.subjects.items():
+        chosen, held_out = protocol.inputs(seq, options.setup), novel_views(seq)
+        shown = [held_out[i] for i in np.linspace(0, len(held_out) - 1, options.columns).round().astype(int)]
+        truth = load_truth(seq, shown, protocol.novel(seq, chosen, shown), options.size)
         rows = {"truth": truth.picture}
-        for m in tqdm(args.methods, desc=s.name, unit="method", disable=None):
-            rows[m.label] = draw(reconstruct(s.views(chosen, m), m), truth.views)[0]
-        frames = [f"frame {s.seq.views[i].frame}" for i in shown]
-        save_picture(grid(rows, frames), args.out / f"pictures-{s.name.replace('/', '-')}-{args.setup}", command)
+        for m in tqdm(options.methods, desc=name, unit="method", disable=None):
+            rows[m.label] = draw(scene_of(options, seq, chosen, m), truth.views)[0]
+        frames = [f"frame {seq.views[i].frame}" for i in shown]
+        stem = options.out / f"pictures-{name.replace('/', '-')}-{options.setup}"
+        save_picture(grid(rows, frames), stem, options.made_by.caption)
 
 
 METHODS = "sweep,predicted"

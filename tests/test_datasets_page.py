@@ -10,7 +10,7 @@ import pytest
 from timesplat.cli import main
 from timesplat.datagen.rigs import RIGS
 from timesplat.datagen.sequence import read_sequence
-from timesplat.evaluation import contact_sheet as sheet
+from timesplat.evaluation import contact_sheet
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs/datasets.md").read_text()
 
@@ -48,12 +48,14 @@ def test_the_rigs_have_as_many_pictures_as_it_says():
 
 def test_the_contact_sheet(folder, tmp_path, capsys):
     seq = read_sequence(folder / "data/zoo/zoo-1000104/zoo")
-    picture = np.asarray(sheet.sheet(seq, 3))
+    picture = np.asarray(contact_sheet.contact_sheet(seq, 3))
     rows = 6 + 1 + 2  # six cameras, the target, depth and motion
     assert picture.shape == (20 + rows * (8 + 4), 96 + 3 * (8 + 4), 3)
     first = picture[20:28, 96:104].astype(int)
     image = seq.load_image(0).astype(float)
     over = image[..., :3] * image[..., 3:] / 255 + 255 - image[..., 3:]
     assert np.abs(first - over).max() <= 1
-    assert sheet.main([str(folder), str(tmp_path / "x.png")]) == 2 and "transforms.json" in capsys.readouterr().err
+    assert (
+        contact_sheet.main([str(folder), str(tmp_path / "x.png")]) == 2 and "transforms.json" in capsys.readouterr().err
+    )
     assert not (tmp_path / "x.png").exists()

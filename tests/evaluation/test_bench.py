@@ -3,7 +3,6 @@
 
 import json
 import shlex
-import shutil
 import subprocess
 import sys
 
@@ -15,9 +14,19 @@ from hypothesis import strategies as st
 from timesplat.cli import main
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.evaluation import bench, charts, figures, labels
-from timesplat.evaluation.bench import Point, parse
-from timesplat.evaluation.pareto import frontier, read_csv, standard_error, summarise, write_csv
-from timesplat.model.fitting.budget import SECONDS
+from timesplat.evaluation.bench import AXES, Point, runs_of
+from timesplat.evaluation.bench_summary import (
+    COLUMNS,
+    bench_row,
+    frontier,
+    read_csv,
+    standard_error,
+    summarise,
+    write_csv,
+)
+from timesplat.evaluation.cache import Cache
+from timesplat.evaluation.method_spec import parse_spec
+from timesplat.evaluation.runner import Conditions, run_all
 
 COORDINATES = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12)
 
@@ -37,28 +46,9 @@ def test_frontier_is_what_brute_force_says(points):
     assert [cost[i] for i in found] == sorted(cost[i] for i in found)
 
 
-def test_labels():
-    way = parse("4dgs:10+budget:10%")
-    assert (way.name, way.spec, way.seconds, way.baseline) == ("4dgs", "4dgs+budget:10%", 10, True)
-    assert way.fit == 10 + SECONDS
-    assert parse("guided+budget:5%").fit == SECONDS and parse("guided+refine:3+budget:5%").fit == 3
-    way = parse("guided+refine:3")
-    assert way.fit == 3 and way.passes and not way.baseline and way.checkpoint is None
-    for label, says in (
-        ("4dgs", "take seconds"),
-        ("lift:3", "take seconds"),
-        ("magic", "no such method"),
-        ("guided@huge", "no checkpoint guided-huge"),
-        ("rgb+magic", "in this order"),
-        ("", "write a way"),
-    ):
-        with pytest.raises(InputError, match=says):
-            parse(label)
-
-
-def test_every_label_of_the_tables_is_a_way_and_is_drawn_as_one():
-    assert len(set(bench.CENTRE)) == len(bench.CENTRE) and set(bench.AXES) <= set(bench.CENTRE)
-    assert {parse(x).name for x in bench.CENTRE} <= set(charts.FAMILIES)
+def test_every_label_of_the_axes_is_a_method_and_is_drawn_as_one():
+    assert len(set(AXES.centre)) == len(AXES.centre) and set(AXES.elsewhere) <= set(AXES.centre)
+    assert {parse_spec(x).method for x in AXES.centre} <= set(charts.FAMILIES)
 
 
 # ---------------------------------------------------------------- rows
@@ -72,10 +62,12 @@ def rows_of(
     for setup, size in (("random", 128), ("views-8", 128), ("random", 64)):
         for i, w in enumerate(ways):
             for j, o in enumerate(objects):
-                r = dict.fromkeys(bench.COLUMNS, 1.0) | {"object": o, "way": w, "setup": setup, "size": size}
+                r = dict.fromkeys(COLUMNS, 1.0) | {"object": o, "way": w, "setup": setup, "size": size}
                 n = 1000 / (1 + i)
                 r |= {"views": 8 if "8" in setup else 24, "seconds": 1.0 + i, "psnr": 20.0 + 2 * j + i + 0.1 * i * j}
-                rows.append(r | {"flip": 0.1 / (1 + i), "gaussians": n, "ply_mb": n / 1e4, "usd_mb": None})
+                rows.append(
+                    r | {"flip": 0.1 / (1 + i), "gaussians": n, "ply_mb": n / 1e4, "usd_mb": None, "lpips": None}
+                )
     return rows
 
 
@@ -96,7 +88,7 @@ def test_csv_gives_back_what_went_in(tmp_path):
     back, command, facts = read_csv(tmp_path / "bench.csv")
     assert (command, facts) == ("timesplat bench x", FACTS)
     for a, b in zip(back, rows, strict=True):
-        assert all(a[k] == (pytest.approx(b[k], rel=1e-6) if isinstance(b[k], float) else b[k]) for k in bench.COLUMNS)
+        assert all(a[k] == (pytest.approx(b[k], rel=1e-6) if isinstance(b[k], float) else b[k]) for k in COLUMNS)
     text = (tmp_path / "bench.csv").read_text()
     for damage in (text[: len(text) // 2], "a,b\n1,2\n", text.replace("guided", "magic"), ""):
         (tmp_path / "bad.csv").write_text(damage)
@@ -107,7 +99,7 @@ def test_csv_gives_back_what_went_in(tmp_path):
 
 
 def test_means_compare_object_by_object():
-    means = {m.way.label: m for m in summarise(rows_of(), ("random", 128)) if (m.setup, m.size) == ("random", 128)}
+    means = {m.method.label: m for m in summarise(rows_of(), ("random", 128)) if (m.setup, m.size) == ("random", 128)}
     guided, refined = means["guided"], means["guided+refine:1"]
     assert guided.mean["psnr"] == 22 and guided.gain["psnr"] == 0 == guided.gain_error["psnr"]
     assert guided.error["psnr"] == pytest.approx(2 / 3**0.5)
@@ -117,7 +109,7 @@ def test_means_compare_object_by_object():
     assert means["4dgs:1"].gain["psnr"] == pytest.approx(1.1)  # against rgb
     assert guided.mean["usd_mb"] is None
     cut = [r for r in rows_of() if not (r["way"] == "rgb" and r["object"] == "c")]
-    assert "rgb" not in {m.way.label for m in summarise(cut, ("random", 128))}
+    assert "rgb" not in {m.method.label for m in summarise(cut, ("random", 128))}
 
 
 # ---------------------------------------------------------------- pictures
@@ -165,27 +157,19 @@ def test_budgets_are_drawn_against_no_budget():
 # ---------------------------------------------------------------- running
 
 
-@pytest.fixture
-def folders(sphere_folder, tmp_path):
-    """Two objects with one Sequence each."""
-    for name in ("a/line", "b/line"):
-        copy = shutil.copytree(sphere_folder, tmp_path / "data" / name) / "transforms.json"
-        copy.write_text(copy.read_text() + " " * (name[0] == "b"))  # not the same Sequence
-    return tmp_path / "data"
-
-
 def test_points_are_what_objects_allow(folders):
     sequences = {n: read_sequence(folders / n / "line") for n in "ab"}
     points, notes = bench.plan(sequences)
     assert {(p.setup, p.size) for p in points} == {("", 32)} and "not random views" in notes[0]
-    assert [p.label for p in points][: len(bench.CENTRE)] == bench.CENTRE
-    assert all(parse(p.label).fit <= 3 for p in bench.plan(sequences, quick=True)[0])
+    assert tuple(p.label for p in points)[: len(AXES.centre)] == AXES.centre
+    assert all(p.method.fit_seconds <= 3 for p in bench.plan(sequences, quick=True)[0])
     for view in sequences["b"].views:
         view.passes = None
     points, notes = bench.plan(sequences)
-    assert not any(parse(p.label).passes for p in points) and "b has no depth" in notes[0]
-    stages = [[p.label for p in s] for s in bench._stages(points)]
-    assert [x for s in stages for x in s if x.endswith("30")] == [x for s in stages[-1:] for x in s]
+    assert not any(p.method.has_depth for p in points) and "b has no depth" in notes[0]
+    order = [(r.method.label, r.object) for r in runs_of(sequences, points)]
+    slowest = [(x, n) for n in "ab" for x in ("4dgs:30", "som:30", "rgb+refine:30")]
+    assert order[-len(slowest) :] == slowest
 
 
 def test_the_axes_go_through_the_centre(folders, monkeypatch):
@@ -203,21 +187,16 @@ def test_the_axes_go_through_the_centre(folders, monkeypatch):
         bench.plan(sequences)
 
 
-def test_a_run_goes_on_where_it_was(folders, tmp_path, monkeypatch):
+def test_rows_of_the_runner_are_rows_of_the_csv(folders, tmp_path):
     sequences = {n: read_sequence(folders / n / "line") for n in "ab"}
-    points = [Point(x, "", 32) for x in ("lift", "hull", "gs-lrm-frame")]
-    first = bench.run(sequences, points, tmp_path, started=100.0)
-    assert [(r["way"], r["object"]) for r in first] == [(p.label, n) for p in points for n in "ab"]
-    assert first[0]["ply_mb"] * 1e6 > 50 * first[0]["gaussians"] and first[4]["ply_mb"] is None
-    assert first[0]["psnr"] > first[2]["psnr"] and 0 < first[0]["flip"] < 1 and first[0]["views"] == 24
-    lines = (tmp_path / "rows.jsonl").read_text().splitlines()
-    assert len(lines) == 6 and bench.spent(tmp_path / "rows.jsonl") == max(json.loads(x)["elapsed"] for x in lines)
-    (tmp_path / "rows.jsonl").write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:50])
-    made, plain = [], bench.measure
-    monkeypatch.setattr(bench, "measure", lambda *a: made.append(a[0]) or plain(*a))
-    second = bench.run(sequences, points, tmp_path)
-    assert len(made) == 1 and [r["psnr"] for r in second] == [r["psnr"] for r in first]
-    assert bench.run(sequences, points, tmp_path / "late", deadline=0) == []
+    runs = runs_of(sequences, [Point(x, "", 32) for x in ("lift", "hull", "gs-lrm-frame")])
+    cache = Cache(tmp_path)
+    rows = [bench_row(r) for r in run_all(runs, cache, Conditions(costs=True, one_thread=True, started=100.0))]
+    assert [(r["way"], r["object"]) for r in rows] == [(r.method.label, r.object) for r in runs]
+    lift, gs_lrm = rows[0], rows[2]
+    assert lift["ply_mb"] * 1e6 > 50 * lift["gaussians"] and gs_lrm["ply_mb"] is None and lift["coverage"] > 0.5
+    assert lift["psnr"] > rows[1]["psnr"] and 0 < lift["flip"] < 1 and lift["views"] == 24
+    assert cache.seconds_spent() == max(r["elapsed"] for r in cache.rows().values())
 
 
 def test_the_command_on_small_objects(folders, tmp_path, capsys):
@@ -238,7 +217,8 @@ def test_bad_options_are_refused_before_anything_runs(folders, tmp_path, capsys)
         (["--objects", "0"], "--objects 0: give 1"),
         (["--limit", "0"], "--limit 0: give more"),
         (["--size", "100"], "--size 100: give 64"),
-        (["--methods", "lift,4dgs"], "take seconds"),
+        (["--methods", "lift:3"], "take seconds"),
+        (["--device", "tpu7"], "tpu7: torch cannot use this device"),
         (["--draw", str(tmp_path / "no.csv")], "no.csv: no such file"),
     ):
         assert main([*words, *more]) == 2

@@ -7,15 +7,22 @@ import pytest
 from PIL import Image
 
 from timesplat.evaluation import figures
+from timesplat.evaluation.provenance import Provenance
 
 
 def test_a_table_is_markdown_and_csv_with_its_command(tmp_path):
     rows = [["lift", "25.10 ± 0.20"], ["a, b", ""]]
-    text = figures.write_table(tmp_path / "new" / "t", "Title", ["method", "PSNR (dB)"], rows, "python -m x", ["Note."])
+    made_by = Provenance("python -m x", "1.0")
+    text = figures.write_table(tmp_path / "new" / "t", "Title", ["method", "PSNR (dB)"], rows, made_by, ["Note."])
     assert (tmp_path / "new" / "t.md").read_text() == text
-    assert "`python -m x`" in text and "| lift | 25.10 ± 0.20 |" in text and text.endswith("Note.\n")
-    first, *sheet = (tmp_path / "new" / "t.csv").read_text().splitlines()
-    assert first == "# python -m x" and list(csv.reader(sheet)) == [["method", "PSNR (dB)"], *rows]
+    assert "`python -m x`" in text and "timesplat 1.0" in text
+    assert "| lift | 25.10 ± 0.20 |" in text and text.endswith("Note.\n")
+    first, second, *sheet = (tmp_path / "new" / "t.csv").read_text().splitlines()
+    assert (first, second) == ("# python -m x", "# timesplat 1.0")
+    assert list(csv.reader(sheet)) == [
+        ["method", "PSNR (dB)"],
+        *rows,
+    ]
     assert {p.name for p in (tmp_path / "new").iterdir()} == {"t.md", "t.csv"}
 
 

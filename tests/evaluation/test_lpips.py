@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError
-from timesplat.evaluation.lpips import CHANNELS, LAYERS, LPIPS, load_linear
+from timesplat.evaluation.lpips import CHANNELS, LAYERS, find_lpips, load_linear
 from timesplat.model.training.vgg import VGG
 
 
@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
 
 def test_the_definition(folder, monkeypatch):
     monkeypatch.setenv("TIMESPLAT_WEIGHTS", str(folder))
-    lpips = LPIPS.find()
+    lpips = find_lpips()
     x, y = torch.rand(2, 2, 32, 32, 3)
     expected = torch.zeros(2)
     linear = torch.load(folder / "lpips_vgg.pth")
@@ -38,7 +38,7 @@ def test_the_definition(folder, monkeypatch):
 def test_missing_and_damaged_files(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("TIMESPLAT_WEIGHTS", str(tmp_path))
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    assert LPIPS.find() is None
+    assert find_lpips() is None
     bad = tmp_path / "lpips_vgg.pth"
     bad.write_bytes(b"no")
     with pytest.raises(InputError, match=r"lpips_vgg.pth.*copy the file again"):

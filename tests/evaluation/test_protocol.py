@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from timesplat.datagen import rigs
-from timesplat.datagen.sequence import InputError, Sequence, View
+from timesplat.datagen.sequence import InputError, Sequence, View, read_sequence
 from timesplat.evaluation import protocol
 
 
@@ -82,3 +82,10 @@ def test_refusals():
         protocol.targets(Sequence(8, 8, 24, 0, 0, views=[View(0, "a", "orbit", np.eye(4), 1, 1, 1, 1)]))
     with pytest.raises(InputError, match="--stride 0"):
         protocol.targets(sequence(), 0)
+
+
+def test_chosen_frames_cycle_through_the_canonical_cameras(evaluation_folder):
+    seq = read_sequence(evaluation_folder)
+    views = [seq.views[i] for i in protocol.every_nth(seq, 4)]
+    assert [v.frame for v in views] == list(range(0, 24, 4))
+    assert [v.camera for v in views] == ["front", "left", "back", "right", "front", "left"]

@@ -1,8 +1,9 @@
 """Where figures come from: revision, uncommitted changes, hashes."""
 
+import os
 import subprocess
 
-from timesplat.evaluation.provenance import Provenance, revision
+from timesplat.evaluation.provenance import Provenance, machine, revision
 
 
 def git(folder, *words):
@@ -29,3 +30,8 @@ def test_checkpoints_are_told_apart_by_their_bytes(tmp_path):
     made = Provenance.of("timesplat x", [tmp_path / "a.safetensors", tmp_path / "none.safetensors"])
     assert made.checkpoints == {"a.safetensors": "ba7816bf8f01"}  # of SHA-256("abc"), FIPS 180-2
     assert "a.safetensors ba7816bf8f01" in str(made)
+
+
+def test_the_machine_is_named_where_affinity_does_not_exist(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS and Windows
+    assert machine()["cores"] == os.cpu_count()

@@ -1,16 +1,17 @@
 """Figures of many views, and the tables that are made of them."""
 
 import csv
-import os
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from timesplat.evaluation import tables
+from timesplat.evaluation import paper, tables
+from timesplat.evaluation.metrics import summarise
+from timesplat.evaluation.paper import paper_rows
 from timesplat.evaluation.provenance import Provenance
-from timesplat.evaluation.tables import COLUMNS, collect, gather, paper_rows, summarise, table
+from timesplat.evaluation.tables import COLUMNS, collect, gather, table
 
 MADE = Provenance(
     "timesplat evaluate data --setup all", "1.0", "1234567890ab", False, {"guided.safetensors": "0123456789ab"}
@@ -24,6 +25,7 @@ def row(values, setup="alternating", size=128, name="a", method="lift"):
     frames["novel"] = novel
     cost = {"seconds": 1.0, "seconds_scoring": 0.1, "gaussians": 2, "gaussians_kept": 1}
     what = {"setup": setup, "size": size, "object": name, "method": method, "stride": 1, "jobs": 1}
+    what["has_depth"] = method == "lift"
     return summarise(frames) | cost | what | {"frames": frames}
 
 
@@ -77,7 +79,7 @@ def test_csv_holds_ours_and_the_papers(metrics):
 
 def test_the_papers_rows():
     """All rows are there; single figures that stand out, and the empty cells."""
-    consistent, objaverse = (paper_rows(t) for t in tables.PAPER.values())
+    consistent, objaverse = (paper_rows(t) for t in paper.TABLES.values())
     assert [len(consistent), len(objaverse)] == [10, 9]
     assert consistent[-1][3]["alternating"] == {"psnr": 32.177, "lpips": 0.028, "ssim": 0.98}
     assert consistent[3][1] == "SoM" and "interpolation" not in consistent[3][3]
@@ -96,8 +98,3 @@ def test_one_setup_is_flat_and_files_are_whole(tmp_path: Path):
     assert (
         (tmp_path / "metrics.md").read_text().startswith("`timesplat evaluate x`\n\ntimesplat 1.0\n\n| method | PSNR |")
     )
-
-
-def test_the_machine_is_named_where_affinity_does_not_exist(monkeypatch):
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # as on macOS and Windows
-    assert tables.machine()["cores"] == os.cpu_count()

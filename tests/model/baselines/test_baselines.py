@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError
-from timesplat.evaluation.metrics import psnr
+from timesplat.evaluation.image_quality import psnr
 from timesplat.model.baselines.four_dgs import four_dgs
 from timesplat.model.baselines.gs_lrm import all_in, per_frame
 from timesplat.model.baselines.shape_of_motion import Motion, som

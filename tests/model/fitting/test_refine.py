@@ -8,7 +8,9 @@ import torch
 
 from timesplat.cli import main
 from timesplat.datagen.sequence import InputError, read_sequence
-from timesplat.evaluation.evaluate import evaluate_method, parse_method
+from timesplat.evaluation.loading import load_inputs, load_truth
+from timesplat.evaluation.method_spec import parse_spec
+from timesplat.evaluation.scoring import evaluate_views
 from timesplat.model.fitting.refine import JUDGES, around, error, judging, part, refine, start_size
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
@@ -120,9 +122,9 @@ def test_from_the_command_line_and_in_the_tables(scene, write_views, tmp_path, c
     assert "give 0 or more" in capsys.readouterr().err
     assert main([*args, "--refine", "0.5"]) == 0
     assert len(read_ply(tmp_path / "a.ply")) > 100
-    assert parse_method("hull+refine:0.5").refine == 0.5
     seq = read_sequence(folder)
     chosen = [i for i, v in enumerate(seq.views) if v.rig != "target"]
     targets = [i for i, v in enumerate(seq.views) if v.rig == "target"]
-    row = {m: evaluate_method(seq, m, chosen, targets)[0]["psnr"] for m in ("hull", "hull+refine:1")}
+    views, truth = load_inputs(seq, chosen, False), load_truth(seq, targets, targets)
+    row = {m: evaluate_views(views, parse_spec(m), truth)[0]["psnr"] for m in ("hull", "hull+refine:1")}
     assert row["hull+refine:1"] > row["hull"]

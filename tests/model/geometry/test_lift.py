@@ -6,8 +6,8 @@ import torch
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import opengl_to_opencv
-from timesplat.evaluation.evaluate import draw
-from timesplat.evaluation.metrics import psnr
+from timesplat.evaluation.image_quality import psnr
+from timesplat.evaluation.scoring import draw
 from timesplat.model.gaussians import rotation_matrix
 from timesplat.model.geometry import lift as lift_module
 from timesplat.model.geometry import tracking as follow_module

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rows of `bench` to bench.csv and back, to means over objects, and to what no other way beats (Pareto frontiers)."""
+"""Rows of `timesplat bench` to bench.csv and back, to means over objects, and to what no other method beats (Pareto
+frontiers)."""
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,21 +13,32 @@ from pathlib import Path
 import numpy as np
 
 from ..datagen.sequence import InputError
-from .bench import COLUMNS, FIGURES, Way, parse
+from .figures import write_whole
+from .method_spec import MethodSpec, parse_spec
+from .metrics import METRICS
+from .scoring import COSTS
+
+FIGURES = ("seconds", *METRICS, "gaussians", *COSTS)
+COLUMNS = ("object", "way", "setup", "views", "size", *FIGURES)  # way: the label of a MethodSpec
+
+
+def bench_row(row: dict) -> dict:
+    """COLUMNS of a row of the runner. None where a figure cannot be: a scene that is no 4D Gaussians has no files, for
+    example. Gaussians are those that the filters keep."""
+    row = row | {"way": row["method"], "gaussians": row["gaussians_kept"]}
+    return {k: row[k] for k in COLUMNS}
 
 
 def write_csv(path: Path, rows: list[dict], command: str, facts: dict) -> None:
     """COLUMNS of rows, after two comments: the command, and facts (machine, date, …) as JSON. Whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tmp = path.with_name(f".{path.name}.tmp")
-    with open(tmp, "w", newline="") as f:
-        f.write(f"# {command}\n# {json.dumps(facts)}\n")
-        writer = csv.writer(f, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for r in rows:
-            cells = (r.get(k) for k in COLUMNS)
-            writer.writerow(["" if c is None else f"{c:.7g}" if isinstance(c, float) else c for c in cells])
-    tmp.replace(path)
+    text = io.StringIO()
+    text.write(f"# {command}\n# {json.dumps(facts)}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for r in rows:
+        cells = (r.get(k) for k in COLUMNS)
+        writer.writerow(["" if c is None else f"{c:.7g}" if isinstance(c, float) else c for c in cells])
+    write_whole(path, text.getvalue().encode())
 
 
 def read_csv(path: Path) -> tuple[list[dict], str, dict]:
@@ -40,10 +53,10 @@ def read_csv(path: Path) -> tuple[list[dict], str, dict]:
         for r in csv.DictReader(lines):
             if None in r.values():
                 raise ValueError("cut off")
-            r |= {k: float(r[k]) if r[k] else None for k in FIGURES}
+            r |= {k: float(r[k]) if r.get(k) else None for k in FIGURES}  # a metric may be younger than the file
             rows.append({k: r[k] for k in COLUMNS} | {k: int(r[k]) for k in ("views", "size")})
         for r in rows:
-            parse(r["way"])
+            parse_spec(r["way"], seconds=10.0)
         if not (first.startswith("# ") and rows and {"centre", "notes", "jobs", "seconds_total"} <= set(facts)):
             raise ValueError
     except (ValueError, KeyError, TypeError):
@@ -53,22 +66,22 @@ def read_csv(path: Path) -> tuple[list[dict], str, dict]:
 
 @dataclass
 class Mean:
-    """A Point over objects."""
+    """A method in a setup at a size, over objects."""
 
-    way: Way
+    method: MethodSpec
     setup: str
     views: int
     size: int
     count: int  # objects
     mean: dict[str, float | None]  # of FIGURES
     error: dict[str, float]  # standard errors over objects; 0 for one object
-    gain: dict[str, float] = field(default_factory=dict)  # psnr and flip against the centre, same objects
+    gain: dict[str, float] = field(default_factory=dict)  # of metrics against the centre, same objects
     gain_error: dict[str, float] = field(default_factory=dict)  # standard errors of these paired differences
 
 
-def reference(way: Way) -> str:
-    """The way at the centre that a way is compared with: they see the same."""
-    return "guided" if way.passes else "rgb"
+def reference(method: MethodSpec) -> str:
+    """The one at the centre that a method is compared with: they see the same."""
+    return "guided" if method.has_depth else "rgb"
 
 
 def summarise(rows: list[dict], centre: tuple[str, int]) -> list[Mean]:
@@ -81,15 +94,16 @@ def summarise(rows: list[dict], centre: tuple[str, int]) -> list[Mean]:
     for (label, setup, size), objects in groups.items():
         if len(objects) < most:
             continue
-        way, mean, error = parse(label), {}, {}
+        method, mean, error = parse_spec(label, seconds=10.0), {}, {}
         for k in FIGURES:
             values = [r[k] for r in objects.values()]
             known = None not in values
             mean[k], error[k] = (float(np.mean(values)), standard_error(values)) if known else (None, 0.0)
-        m = Mean(way, setup, next(iter(objects.values()))["views"], size, len(objects), mean, error)
-        other = groups.get((reference(way), *centre), {})
-        for k in ("psnr", "flip"):
-            differences = [r[k] - other[n][k] for n, r in objects.items() if n in other]
+        m = Mean(method, setup, next(iter(objects.values()))["views"], size, len(objects), mean, error)
+        other = groups.get((reference(method), *centre), {})
+        for k in METRICS:
+            pairs = [(r[k], other[n][k]) for n, r in objects.items() if n in other]
+            differences = [a - b for a, b in pairs if a is not None and b is not None]
             if differences:
                 m.gain[k], m.gain_error[k] = float(np.mean(differences)), standard_error(differences)
         found.append(m)

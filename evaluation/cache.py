@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The folder in which an evaluation keeps what it has made, so that the same command goes on where it was:
+
+renders/RIG/OBJECT/CLIP     Sequences                    rows.jsonl      a line for each finished run
+scenes/KEY.safetensors      scenes that were asked for
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+from tqdm import tqdm
+
+from ..datagen.render import Settings, render_assets
+from ..datagen.sequence import Sequence, read_sequence, sequences_in
+from ..model.gaussians import FIELDS, Gaussians4D, Moving
+
+
+class Cache:
+    """What lies below `folder`; nothing is written before the first row, scene or render."""
+
+    def __init__(self, folder: Path):
+        self.folder = Path(folder)
+        self.path = self.folder / "rows.jsonl"
+
+    # ---------------------------------------------------------------- Sequences
+
+    def sequences(self, assets: list[str], settings: Settings, jobs: int) -> tuple[dict[str, Sequence], list[str]]:
+        """Of files and folders: the finished Sequences in them, and those of assets, rendered where they are not yet,
+        by name; and one sentence for each asset that failed."""
+        found, others = find_sequences(assets)
+        if not others:
+            return found, []
+        with tqdm(total=0, desc="rendering", unit="object", disable=None) as bar:
+
+            def progress(done: int, total: int, images: int) -> None:
+                bar.total, bar.n = total, done
+                bar.refresh()
+
+            folder = self.folder / "renders" / settings.rig
+            made, failures = render_assets(others, folder, settings, jobs=jobs, report=bar.write, progress=progress)
+        return found | {f.parent.name: read_sequence(f) for f in sorted(made)}, failures
+
+    # ---------------------------------------------------------------- rows
+
+    def rows(self) -> dict[str, dict]:
+        """{key: row}; a line that was cut off is left out."""
+        found = {}
+        for line in self.path.read_text().splitlines() if self.path.exists() else ():
+            try:
+                row = json.loads(line)
+                found[row["key"]] = row
+            except (ValueError, KeyError, TypeError):
+                continue
+        return found
+
+    def add(self, row: dict) -> None:
+        """A line of JSON in one write, so that lines of several processes never mix; a line that was cut off before it
+        is ended."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with open(self.path, "a+b", buffering=0) as f:
+            start = b""
+            if f.tell():
+                f.seek(-1, 2)
+                start = b"" if f.read(1) == b"\n" else b"\n"
+            f.write(start + (json.dumps(row) + "\n").encode())
+
+    def seconds_spent(self) -> float:
+        """Seconds by the clock that all sessions that wrote rows took."""
+        sessions: dict[float, float] = {}
+        for row in self.rows().values():
+            sessions[row["session"]] = max(sessions.get(row["session"], 0.0), row["elapsed"])
+        return sum(sessions.values())
+
+    # ---------------------------------------------------------------- scenes
+
+    def scene(self, key: str) -> Gaussians4D | None:
+        """The scene of a run that was kept, if it was."""
+        path = self._scene_path(key)
+        return Gaussians4D(**load_file(path)) if path.is_file() else None
+
+    def keep_scene(self, key: str, scene: Gaussians4D | Moving) -> None:
+        """Keeps a scene of 4D Gaussians, whole or not at all; other kinds are not kept."""
+        if not isinstance(scene, Gaussians4D):
+            return
+        path, axed = self._scene_path(key), scene.with_axes()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tmp = path.with_suffix(".tmp")
+        save_file({k: torch.clone(getattr(axed, k)).contiguous() for k in FIELDS}, tmp)
+        tmp.replace(path)
+
+    def _scene_path(self, key: str) -> Path:
+        return self.folder / "scenes" / f"{key}.safetensors"
+
+
+def find_sequences(assets: list[str]) -> tuple[dict[str, Sequence], list[str]]:
+    """Of files and folders: the finished Sequences in them by name, and those that hold none and are to be rendered."""
+    folders, others = [], []
+    for asset in assets:
+        found = sequences_in(Path(asset))
+        folders += found
+        others += [] if found else [asset]
+    return {n: read_sequence(f) for n, f in name_sequences(folders).items()}, others
+
+
+def name_sequences(folders: list[Path]) -> dict[str, Path]:
+    """{name: folder}: a Sequence is named by the folder above its clip's, with the clip where an object has several."""
+    objects = [f.parent.name for f in folders]
+    names = [o if objects.count(o) == 1 else f"{o}/{f.name}" for o, f in zip(objects, folders, strict=True)]
+    return dict(zip(names, folders, strict=True))

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One way to go from posed images to a scene, as it is written on command lines and in tables:
+
+[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+budget:N|P%|auto][+dense]
+
+guided                                      a method of `timesplat reconstruct`
+4dgs:10                                     one that fits the scene, for ten seconds
+rgb+refine:4+budget:10%                     refined for four seconds, with a tenth of the Gaussians
+mine=predicted@runs/mine/network.safetensors    other weights, under a name of its own
+guided@small                                the shipped checkpoint guided-small
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..datagen.sequence import InputError
+from ..model.fitting.budget import SECONDS as BUDGET_SECONDS
+from ..model.fitting.budget import parse as parse_budget
+from ..model.reconstruct import CHECKPOINTS, FITTED, METHODS, NEEDS_PASSES, WEIGHTS
+from .provenance import file_hash
+
+FORM = "[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+budget:N|P%|auto][+dense]"
+_NUMBER = r"\d+(?:\.\d+)?"
+_SPEC = re.compile(
+    rf"(?:(?P<label>[^=+@:]+)=)?(?P<method>[^=+@:]+)(?:@(?P<weights>[^+]+?))?(?::(?P<seconds>{_NUMBER}))?(?P<options>\+.*)?"
+)
+_OPTION = re.compile(rf"(?:(refine):({_NUMBER})|(budget):({_NUMBER}%?|auto)|(dense))")
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """A method with all that decides what it makes of given views."""
+
+    label: str  # how tables and figures call it
+    method: str  # a name of METHODS
+    checkpoint: Path | None = None  # weights in place of the method's own
+    seconds: float | None = None  # of fitting, for methods that fit the scene
+    refine: float | None = None  # seconds of test-time optimisation
+    budget: str | None = None  # most Gaussians, a share of those predicted, or auto
+    dense: bool = False  # a network's tokens everywhere, not only where the object is
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether it sees depth and motion, not RGB and alpha alone."""
+        return self.method in NEEDS_PASSES
+
+    @property
+    def baseline(self) -> bool:
+        """Whether it is what ours are compared with."""
+        return not METHODS[self.method].startswith("ours")
+
+    @property
+    def fit_seconds(self) -> float:
+        """Seconds of fitting in all, without what the budget `auto` takes to find its number."""
+        return (self.seconds or 0.0) + (self.refine or (BUDGET_SECONDS if self.budget else 0.0))
+
+    @property
+    def weights(self) -> Path | None:
+        """The checkpoint that it loads; None where there is none of the method's name."""
+        own = CHECKPOINTS / f"{WEIGHTS.get(self.method, self.method)}.safetensors"
+        return self.checkpoint or (own if own.is_file() else None)
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes with all that has a say in the result but the code: the options, and the bytes of the weights."""
+        options = (self.method, self.seconds, self.refine, self.budget, self.dense)
+        return " ".join(map(str, (*options, file_hash(self.weights) if self.weights else "-")))
+
+
+def parse_spec(text: str, seconds: float | None = None, checkpoint: Path | None = None) -> MethodSpec:
+    """A spec; `seconds` for a method that fits the scene where the text names none, `checkpoint` likewise. Raises
+    InputError that names what is unknown, and what there is."""
+    match = _SPEC.fullmatch(text.strip())
+    if not match:
+        raise InputError(f"{text.strip() or 'a method'}: write {FORM}, for example rgb+refine:4.")
+    label, method, weights, own, options = match.groups()
+    if method not in METHODS:
+        raise InputError(f"{method}: no such method; choose from {', '.join(METHODS)}.")
+    if own and method not in FITTED:
+        raise InputError(f"{text}: {' and '.join(FITTED)}, and they alone, take seconds; write for example 4dgs:10.")
+    found: dict = {}
+    for part in (options or "").split("+")[1:]:
+        option = _OPTION.fullmatch(part)
+        name, value = [x for x in (*option.groups(), True) if x][:2] if option else (part, None)
+        if value is None or name in found:
+            raise InputError(f"{text}: {part} is no option here, or given twice; write {FORM}.")
+        found[name] = value
+    if found.get("budget"):
+        parse_budget(found["budget"])
+    if own is not None or method in FITTED:
+        seconds = float(own) if own else seconds
+    else:
+        seconds = None
+    chosen = _checkpoint(text, method, weights) if weights else checkpoint
+    return MethodSpec(
+        label=label or text.strip(),
+        method=method,
+        checkpoint=chosen,
+        seconds=seconds,
+        refine=float(found["refine"]) if "refine" in found else None,
+        budget=found.get("budget"),
+        dense="dense" in found,
+    )
+
+
+def parse_specs(text: str, seconds: float | None = None, checkpoint: Path | None = None) -> list[MethodSpec]:
+    """Comma-separated specs. Raises InputError where there is none, or two have one label."""
+    found = [parse_spec(x, seconds, checkpoint) for x in text.split(",") if x.strip()]
+    if not found or len({m.label for m in found}) < len(found):
+        raise InputError(f"{text or 'methods'}: name at least one, and each once (LABEL=METHOD tells two alike apart).")
+    return found
+
+
+def _checkpoint(text: str, method: str, weights: str) -> Path:
+    """The file named, or the shipped checkpoint METHOD-weights."""
+    shipped = CHECKPOINTS / f"{WEIGHTS.get(method, method)}-{weights}.safetensors"
+    for path in (Path(weights), shipped):
+        if path.is_file():
+            return path
+    raise InputError(f"{text}: there is no checkpoint {weights}; name a file, or train one with `timesplat train`.")

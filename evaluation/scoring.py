@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One scene drawn and scored: views go in, a row of figures comes out."""
+
+from __future__ import annotations
+
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..datagen.sequence import InputError, Sequence
+from ..model.gaussians import Gaussians4D, Moving
+from ..model.geometry.coverage import SURFACES, coverage
+from ..model.io.asset import write_ply
+from ..model.parallel import clock
+from ..model.rasterize import render
+from ..model.rasterize.timeline import WORTH, Timeline
+from ..model.reconstruct import clip_of, reconstruct_views
+from ..model.views import Views
+from .loading import Truth
+from .method_spec import MethodSpec
+from .metrics import Pictures, measure, summarise
+
+
+def reconstruct(views: Views, method: MethodSpec, device: str = "cpu", seconds: float = 10.0) -> Gaussians4D | Moving:
+    """The scene that a method makes of views (with depth and flow where it sees them), unfiltered; `seconds` for a
+    method that fits the scene and names none."""
+    with torch.no_grad():  # methods that fit a scene turn gradients on again
+        return reconstruct_views(
+            views, method.method, device, method.checkpoint, method.seconds or seconds,
+            refine=method.refine or 0.0, budget=method.budget, dense=method.dense,
+        )  # fmt: skip
+
+
+def draw(scene: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
+    """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
+    paper's inference filters."""
+    height, width = views.size
+    if isinstance(scene, Gaussians4D) and len(scene) > WORTH:
+        scene = Timeline(scene)
+    with torch.no_grad():
+        return render(scene, views.c2w, views.intrinsics, views.time, width, height, inference=True)
+
+
+def score(scene: Gaussians4D | Moving, truth: Truth, left_out: tuple[str, ...] = ()) -> dict[str, list]:
+    """`metrics.measure` of the scene's pictures of the views of truth."""
+    return measure(Pictures(*draw(scene, truth.views), truth), left_out)
+
+
+def evaluate_views(
+    views: Views, method: MethodSpec, truth: Truth, device: str = "cpu", left_out: tuple[str, ...] = ()
+) -> tuple[dict, Gaussians4D | Moving]:
+    """Reconstructs from views and scores -> a row: `metrics.summarise` of the scores, which are in `frames`; seconds
+    of the reconstruction and of drawing and scoring a view; how many Gaussians there are, and are kept by the
+    filters. And the scene, of those kept, on the processor."""
+    start = clock()
+    scene = reconstruct(views, method, device)
+    kept = scene[scene.alive()]
+    taken = clock() - start
+    frames = score(kept, truth, left_out)
+    each = (clock() - start - taken) / len(truth.picture)
+    row = {"seconds": taken, "seconds_scoring": each, "gaussians": len(scene), "gaussians_kept": len(kept)}
+    return summarise(frames) | row | {"frames": frames}, kept
+
+
+COSTS = ("ply_mb", "usd_mb", "render_ms", "coverage")
+
+
+def costs(scene: Gaussians4D | Moving, views: Views, truth: Truth, method: MethodSpec, seq: Sequence) -> dict:
+    """COSTS: megabytes of the scene as .ply and, where pxr is installed, as .usdc (None of a scene that no asset can
+    hold); milliseconds to draw a view; the share of the object that the input views show, where it can be told."""
+    start = clock()
+    draw(scene, truth.views)
+    drawing = 1000 * (clock() - start) / len(truth.picture)
+    known = method.method in SURFACES and not (method.refine or method.budget or method.dense)
+    sizes = megabytes(scene, seq)
+    return dict(zip(COSTS, (*sizes, drawing, coverage(scene, views)[0] if known else None), strict=True))
+
+
+def megabytes(scene: Gaussians4D | Moving, seq: Sequence) -> tuple[float | None, float | None]:
+    """Of the scene as .ply and, where pxr is installed, as .usdc."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        ply, usd = Path(folder) / "a.ply", Path(folder) / "a.usdc"
+        try:
+            asset = scene.to_asset(clip_of(seq))
+        except InputError:
+            return None, None
+        write_ply(ply, asset)
+        if find_spec("pxr"):
+            from ..model.io.usd_write import write_usd
+
+            write_usd(usd, asset)
+        return ply.stat().st_size / 1e6, usd.stat().st_size / 1e6 if usd.exists() else None

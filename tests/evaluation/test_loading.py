@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inputs and truth: sizes are averages, moments and thinned clips move as they should."""
+
+import pytest
+import torch
+
+from timesplat.datagen.sequence import InputError, read_sequence
+from timesplat.evaluation import protocol
+from timesplat.evaluation.loading import collapsed, load_inputs, load_truth, thinned
+from timesplat.model.geometry.lift import lift
+
+
+def test_smaller_sizes_are_averages(sphere_folder):
+    seq = read_sequence(sphere_folder)
+    targets = seq.select(rig="target")
+    truth, half = load_truth(seq, targets, targets), load_truth(seq, targets, targets[:1], 16)
+    assert half.picture.shape == (6, 16, 16, 3) and half.novel.tolist() == [True] + [False] * 5
+    blocks = truth.picture.reshape(6, 16, 2, 16, 2, 3).mean((2, 4))
+    assert torch.allclose(half.picture, blocks, atol=1e-6)
+    assert torch.allclose(half.views.intrinsics * 2, truth.views.intrinsics)
+    with_depth, without = (load_inputs(seq, range(24), depth, 16) for depth in (True, False))
+    assert torch.equal(with_depth.rgb, without.rgb) and without.depth is None and with_depth.depth is not None
+    assert torch.allclose(without.over(1.0), load_truth(seq, range(24), [], 16).picture, atol=1e-5)
+    with pytest.raises(InputError, match="do not shrink to 20"):
+        load_inputs(seq, range(24), False, 20)
+
+
+def test_a_thinned_clip_moves_at_the_same_speed(spheres):
+    views = spheres([0, 4, 8], size=16)
+    thin = thinned(views, 4)
+    torch.testing.assert_close(thin.flow / thin.frame_step, views.flow / views.frame_step)
+    assert thin.frame_step == pytest.approx(8 / 23)
+
+
+def test_one_moment_is_reconstructed_still(evaluation_folder):
+    seq = read_sequence(evaluation_folder)
+    g = lift(collapsed(load_inputs(seq, protocol.at_frame(seq, 12, "canonical"), True)))
+    assert (g.velocity == 0).all() and (g.t == 0).all() and len(g) > 100
