@@ -61,14 +61,14 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def render_arguments(p: argparse.ArgumentParser) -> None:
-    from .datagen.render import add_arguments
+    from .datagen.farm import add_arguments
 
     add_arguments(p)
 
 
 def render(args: argparse.Namespace) -> int:
     """Render assets (glTF, FBX, OBJ, USD, .blend, procedural zoo) into Sequences: posed images, depth, motion."""
-    from .datagen.render import run
+    from .datagen.farm import run
 
     return run(args)
 
@@ -280,7 +280,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Render what is not yet rendered, reconstruct with each method, score, write tables in the paper's layout."""
     import time
 
-    from .datagen.render import Settings
+    from .datagen.farm import Settings
     from .datagen.rigs import SETUPS
     from .model.evaluate import evaluate_folders, find_sequences
     from .model.lpips import HINT, LPIPS
@@ -329,7 +329,7 @@ def render_into(folder: Path, assets: list[str], settings, jobs: int, sequences:
     """Renders what is not yet rendered, adds it to `sequences` by name, returns what failed."""
     from tqdm import tqdm
 
-    from .datagen.render import render_assets
+    from .datagen.farm import render_assets
     from .datagen.sequence import read_sequence
 
     if not assets:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from .datagen.render import Settings, render_shots
+from .datagen.farm import Settings, render_shots
 from .model.asset import write_ply
 from .model.evaluate import collect, draw, evaluate_method, table, warm_up, write_metrics
 from .model.gaussians import Gaussians4D

@@ -14,7 +14,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from timesplat.benchmarks import charts, renderer
-from timesplat.datagen.render import Settings, cores
+from timesplat.datagen.farm import Settings, cores
 from timesplat.datagen.sequence import InputError
 
 

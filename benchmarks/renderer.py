@@ -32,8 +32,9 @@ COLUMNS = ["object", "samples", "seconds", "psnr"]
 
 def measure(asset: str, size: int = 128, samples=SAMPLES, truth: int = TRUTH, frames=FRAMES) -> list[dict]:
     """Rows of COLUMNS of a zoo object. In a process with bpy: it empties the scene."""
-    from timesplat.datagen import capture, scene, zoo
+    from timesplat.datagen import capture, scene
     from timesplat.datagen.rigs import RIGS
+    from timesplat.datagen.zoo import build as zoo
 
     scene.empty()
     zoo.build(int(asset.removeprefix("zoo:")))

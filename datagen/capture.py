@@ -23,7 +23,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from . import displace
-from .pixels import read_exr, write_png
+from .image_files import read_exr, write_png
 from .rigs import Shot
 from .scene import borrowed
 from .sequence import (

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .pixels import write_exr
+from .image_files import write_exr
 
 FORMAT = "timesplat-sequence-1"
 

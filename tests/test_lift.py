@@ -92,7 +92,8 @@ def dancer(tmp_path_factory):
     from mathutils import Vector
     from mathutils.bvhtree import BVHTree
 
-    from timesplat.datagen import capture, rigs, scene, zoo
+    from timesplat.datagen import capture, rigs, scene
+    from timesplat.datagen.zoo import build as zoo
 
     scene.empty()
     zoo.build(900002)

@@ -10,7 +10,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from timesplat.datagen import zoo, zoo_shapes  # noqa: E402
+from timesplat.datagen.zoo import build as zoo  # noqa: E402
+from timesplat.datagen.zoo import shapes  # noqa: E402
 
 SEEDS = range(30)
 PROBE = (1, 9, 24)
@@ -61,7 +62,7 @@ def test_same_seed_same_object():
 def test_same_in_another_process():
     # Sums of the designs, without Blender's scene: hash seeds and import order must not matter.
     code = (
-        "from timesplat.datagen import zoo\n"
+        "from timesplat.datagen.zoo import build as zoo\n"
         "for s in (3, 4, 5): print(repr(sum(float(p.posed.sum()) for p in zoo._design(s)[0].finish())))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -121,7 +122,7 @@ def test_shapes_face_outwards():
         a, b, c = (points[[corner[k] for corner in corners]] for k in range(3))
         return np.einsum("ni,ni->", a, np.cross(b, c)) / 6
 
-    assert volume(zoo_shapes.blob((1, 2, 3), 2, 16)) == pytest.approx(4 / 3 * np.pi * 6, rel=0.02)
-    assert volume(zoo_shapes.torus(1, 0.3, 48, 24)) == pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
-    capsule = zoo_shapes.tube([(0, 0, 0), (0, 1, 0)], [0.5, 0.5], sides=48)
+    assert volume(shapes.blob((1, 2, 3), 2, 16)) == pytest.approx(4 / 3 * np.pi * 6, rel=0.02)
+    assert volume(shapes.torus(1, 0.3, 48, 24)) == pytest.approx(2 * np.pi**2 * 0.09, rel=0.03)
+    capsule = shapes.tube([(0, 0, 0), (0, 1, 0)], [0.5, 0.5], sides=48)
     assert volume(capsule) == pytest.approx(np.pi * 0.25 + np.pi / 6, rel=0.05)

@@ -14,7 +14,7 @@ from .helpers import REAL, ROOT, TARGET, make
 
 ALLOWED = [
     *("__init__.py", "LICENSE", "README.md", "blender_manifest.toml", "cli.py", "demo.py"),
-    *("addon/*.py", "datagen/*.py", "model/*.py", "model/baselines/*.py", "model/rasterize/*.py"),
+    *("addon/*.py", "datagen/*.py", "datagen/*/*.py", "model/*.py", "model/baselines/*.py", "model/rasterize/*.py"),
     *("model/checkpoints/*.safetensors", "model/checkpoints/*.md"),
 ]
 NEEDED = {

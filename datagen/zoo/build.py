@@ -16,11 +16,11 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from .zoo_floaters import flyer, monster, swimmer
-from .zoo_puppet import FRAMES, TAU, Paint, Puppet
-from .zoo_shapes import apply, rotation, translation
-from .zoo_things import machine, morph, plant, stack, vehicle
-from .zoo_walkers import humanoid, walker
+from .floaters import flyer, monster, swimmer
+from .puppet import FRAMES, TAU, Paint, Puppet
+from .shapes import apply, rotation, translation
+from .things import machine, morph, plant, stack, vehicle
+from .walkers import humanoid, walker
 
 EVALUATION_SEEDS = 1_000_000
 # A change to any family that draws other numbers changes what every seed shows.

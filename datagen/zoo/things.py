@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .zoo_puppet import TAU, Puppet, squash
-from .zoo_shapes import X, Y, Z, blob, gear_outline, lumpy, rotation, scaling, sheet, torus, translation, tube
+from .puppet import TAU, Puppet, squash
+from .shapes import X, Y, Z, blob, gear_outline, lumpy, rotation, scaling, sheet, torus, translation, tube
 
 
 def _wheel(p, parent, at, radius, width, turns, paint="dark"):

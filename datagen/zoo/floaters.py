@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .zoo_puppet import FRAMES, TAU, Puppet, squash
-from .zoo_shapes import X, Y, Z, rotation, scaling, sheet, translation, tube
-from .zoo_walkers import head, nod, tail
+from .puppet import FRAMES, TAU, Puppet, squash
+from .shapes import X, Y, Z, rotation, scaling, sheet, translation, tube
+from .walkers import head, nod, tail
 
 
 def swimmer(p: Puppet):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .zoo_shapes import apply, blob, lumpy, on_blob, rotation, scaling, spline, translation, tube
+from .shapes import apply, blob, lumpy, on_blob, rotation, scaling, spline, translation, tube
 
 FRAMES = 24
 TAU = 2 * np.pi

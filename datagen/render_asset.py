@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One asset in a process of its own: `python -m timesplat.datagen.child JOB.json LOG`, started by `render`.
+"""One asset in a process of its own: `python -m timesplat.datagen.render_asset JOB.json LOG`, started by `render`.
 
 The job names the asset, the settings, and where to write; messages go to stdout as JSON lines ({"image": n,
 "of": total}, {"written": folder}, {"warning": …}, {"error": …}), all that Blender prints goes to the log.
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from .render import ALL, FIRST, MOST, Settings, is_made, stem, zoo_seed
+from .farm import ALL, FIRST, MOST, Settings, is_made, stem, zoo_seed
 from .rigs import RIGS, targets
 from .sequence import InputError, distinct
 
@@ -29,7 +29,7 @@ def run_job(job: dict, say: Callable[[dict], None]) -> None:
     settings, asset = Settings(**job["settings"]), job["asset"]
     provenance: dict = {"asset": Path(asset).name, **scene.versions()}
     if seed := zoo_seed(asset):
-        from . import zoo
+        from .zoo import build as zoo
 
         scene.empty()
         provenance["zoo"] = zoo.build(int(seed))

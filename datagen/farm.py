@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Many assets to Sequences: `timesplat render`.
 
-Each asset is opened and rendered in a child process of its own (`child`, run with a job file), so that one
+Each asset is opened and rendered in a child process of its own (`render_asset`, run with a job file), so that one
 that crashes Blender or eats the memory never takes the others with it. The child writes its messages as JSON
 lines; what Blender prints goes to a log of which the last line is shown if it dies.
 """
@@ -231,7 +231,7 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as tmp:
         file, log = Path(tmp) / "job.json", Path(tmp) / "log"
         file.write_text(json.dumps(job))
-        command = [sys.executable, "-m", "timesplat.datagen.child", str(file), str(log)]
+        command = [sys.executable, "-m", "timesplat.datagen.render_asset", str(file), str(log)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
         running.add(process)
         said_error = False

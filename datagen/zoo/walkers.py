@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .zoo_puppet import FRAMES, TAU, Puppet
-from .zoo_shapes import X, Y, Z, blob, lumpy, rotation, sheet, torus, translation, tube
+from .puppet import FRAMES, TAU, Puppet
+from .shapes import X, Y, Z, blob, lumpy, rotation, sheet, torus, translation, tube
 
 
 def walker(p: Puppet):
