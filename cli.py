@@ -280,7 +280,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Render what is not yet rendered, reconstruct with each method, score, write tables in the paper's layout."""
     import time
 
-    from .datagen.farm import Settings
+    from .datagen.render_job import RenderSettings
     from .datagen.rigs import SETUPS
     from .model.evaluate import evaluate_folders, find_sequences
     from .model.lpips import HINT, LPIPS
@@ -297,7 +297,7 @@ def evaluate(args: argparse.Namespace) -> int:
         raise InputError(f"--jobs {args.jobs}: give 1 or more.")
     several = len(setups) > 1 or len(sizes) > 1 or args.protocol == "paper"
     rig = "evaluation" if several or setups[0] not in SETUPS else setups[0]
-    settings = Settings(rig=rig, targets=1, size=max(sizes), samples=args.samples, seed=args.seed)
+    settings = RenderSettings(rig=rig, targets=1, size=max(sizes), samples=args.samples, seed=args.seed)
 
     sequences, others = find_sequences(args.assets)
     rendered = bool(sequences)

@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from .datagen.farm import Settings, render_shots
+from .datagen.farm import render_shots
+from .datagen.render_job import RenderSettings
 from .model.asset import write_ply
 from .model.evaluate import collect, draw, evaluate_method, table, warm_up, write_metrics
 from .model.gaussians import Gaussians4D
@@ -31,7 +32,7 @@ def run(args: argparse.Namespace, save_blend: Callable[[Path, Path], None]) -> i
     out = args.out
     out.mkdir(parents=True, exist_ok=True)
     clock = time.perf_counter()
-    settings = Settings(targets=1, size=args.size, samples=args.samples)
+    settings = RenderSettings(targets=1, size=args.size, samples=args.samples)
     with tqdm(desc="rendering", unit="image", total=0, disable=None) as bar:
 
         def progress(done: int, total: int) -> None:

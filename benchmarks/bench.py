@@ -14,7 +14,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from timesplat.benchmarks import charts, renderer
-from timesplat.datagen.farm import Settings, cores
+from timesplat.datagen.farm import cores
+from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.sequence import InputError
 
 
@@ -72,7 +73,7 @@ def measure(args: argparse.Namespace, render_into: Callable, started: float) -> 
         bench.parse(label)
     number = args.objects or (2 if args.quick else None)
     sequences, others = find_sequences(args.assets or bench.HELD_OUT[:number])
-    settings = Settings(rig="evaluation", targets=1, size=args.size)
+    settings = RenderSettings(rig="evaluation", targets=1, size=args.size)
     failures = render_into(args.out / "renders", others, settings, args.jobs, sequences)
     sequences = dict(list(sequences.items())[:number])
     if not sequences:

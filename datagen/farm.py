@@ -9,7 +9,6 @@ lines; what Blender prints goes to a log of which the last line is shown if it d
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 import re
@@ -17,134 +16,133 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
 
 from . import ASSET_SUFFIXES
+from .render_job import ALL_CLIPS, RenderSettings, asset_name, expand_folders, finished_sequences
 from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
-
-FIRST, MOST, ALL = "first", "most-moving", "all"
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides the pictures; recorded in the Sequence, and compared when a run resumes."""
-
-    rig: str = "default"  # a name in rigs.RIGS
-    targets: int = 0  # held-out random views a frame
-    clip: str = MOST  # "most-moving", "first", "all" or a clip's name
-    frames: int = 24
-    size: int = 128
-    samples: int = 16
-    passes: bool = True
-    linear: bool = False
-    displace: bool = False  # take a still object and move it a little, see `displace`
-    seed: int = 0
-    device: str = "CPU"
-
-    def __post_init__(self):
-        if self.rig not in RIGS:
-            raise InputError(f"--rig {self.rig}: there is no such rig; choose one of {', '.join(RIGS)}.")
-        for name, low in (("frames", 1), ("size", 8), ("samples", 1), ("targets", 0), ("seed", 0)):
-            if getattr(self, name) < low:
-                raise InputError(f"--{name} {getattr(self, name)}: too small; give {low} or more.")
 
 
 def render_assets(
     assets: list[str],
     out: Path,
-    settings: Settings | None = None,
+    settings: RenderSettings | None = None,
     *,
     jobs: int = 1,
     report: Callable[[str], None] = print,
     progress: Callable[[int, int, int], None] = lambda done, total, images: None,
 ) -> tuple[list[Path], list[str]]:
-    """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<stem>/<clip>`.
+    """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<stem>/<clip>`, `jobs` at a time.
 
     Returns the folders of all Sequences, those found finished included, and one sentence for each asset that
     failed. `report` gets warnings and failures as they happen, `progress` assets done, in all, and images.
     """
-    settings, out = settings or Settings(), Path(out)
-    folders, failures, images = [], [], 0
-    names = expand(assets)
-    todo, seen = [], {}
-    for asset in names:
-        other = seen.setdefault(stem(asset).lower(), asset)  # one folder for both on Windows and macOS
-        if other != asset:
-            failures.append(f"{asset}: it would be written over that of {other}; rename one of the two.")
-        elif finished := _finished(asset, out / stem(asset), settings):
-            folders += finished
-        else:
-            todo.append(asset)
+    settings, out = settings or RenderSettings(), Path(out)
+    names = expand_folders(assets)
+    pending, folders, failures = _sort_out(names, out, settings)
     for sentence in failures:
         report(sentence)
-    done = len(names) - len(todo)
+    done, images = len(names) - len(pending), 0
     progress(done, len(names), images)
 
-    jobs = max(1, min(jobs, len(todo)))
-    free: SimpleQueue[list[int]] = SimpleQueue()
-    for i in range(jobs):  # one core each: twice as efficient as threads that wait for each other
-        free.put([cores()[i % len(cores())]] if jobs > 1 else [])
-    events: SimpleQueue[tuple[str, dict | None]] = SimpleQueue()
-    running: set[subprocess.Popen] = set()
-
-    def work(asset: str) -> None:
-        core = free.get()
-        job = {"asset": asset, "out": str(out / stem(asset)), "settings": asdict(settings), "cores": core}
-        try:
-            _child(job, lambda message: events.put((asset, message)), running)
-        finally:
-            free.put(core)
-            events.put((asset, None))
-
-    with ThreadPoolExecutor(jobs) as pool:
-        try:
-            for asset in todo:
-                pool.submit(work, asset)
-            left = len(todo)
-            while left:
-                asset, message = events.get()
-                if message is None:
-                    left, done = left - 1, done + 1
-                elif "written" in message:
-                    folders.append(Path(message["written"]))
-                elif "image" in message:
-                    images += message["image"]
-                elif "warning" in message:
-                    report(message["warning"])
-                else:
-                    failures.append(message["error"])
-                    report(message["error"])
-                progress(done, len(names), images)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in list(running):
-                process.kill()
-            raise
+    with _Farm(out, settings, max(1, min(jobs, len(pending)))) as farm:
+        for message in farm.render(pending):
+            if message is None:
+                done += 1
+            elif "written" in message:
+                folders.append(Path(message["written"]))
+            elif "image" in message:
+                images += message["image"]
+            elif "warning" in message:
+                report(message["warning"])
+            else:
+                failures.append(message["error"])
+                report(message["error"])
+            progress(done, len(names), images)
     return folders, failures
+
+
+def _sort_out(names: list[str], out: Path, settings: RenderSettings) -> tuple[list[str], list[Path], list[str]]:
+    """Assets still to render, folders of Sequences that are finished, and a sentence for each asset that another one
+    of the same name would overwrite."""
+    pending, finished, failures, seen = [], [], [], {}
+    for asset in names:
+        other = seen.setdefault(asset_name(asset).lower(), asset)  # one folder for both on Windows and macOS
+        if other != asset:
+            failures.append(f"{asset}: it would be written over that of {other}; rename one of the two.")
+        elif folders := finished_sequences(out / asset_name(asset), asset, settings):
+            finished += folders
+        else:
+            pending.append(asset)
+    return pending, finished, failures
+
+
+class _Farm:
+    """Child processes, so many at a time. As a context: an exception inside kills those that run."""
+
+    def __init__(self, out: Path, settings: RenderSettings, jobs: int) -> None:
+        self.out, self.settings = out, settings
+        self.pool = ThreadPoolExecutor(jobs)
+        self.running: set[subprocess.Popen] = set()
+        self.messages: SimpleQueue[dict | None] = SimpleQueue()
+        self.free_cores: SimpleQueue[list[int]] = SimpleQueue()
+        for i in range(jobs):  # one core each: twice as efficient as threads that wait for each other
+            self.free_cores.put([cores()[i % len(cores())]] if jobs > 1 else [])
+
+    def __enter__(self) -> _Farm:
+        return self
+
+    def __exit__(self, kind, error, traceback) -> None:
+        if kind:
+            self.pool.shutdown(wait=False, cancel_futures=True)
+            for process in list(self.running):
+                process.kill()
+        self.pool.shutdown()
+
+    def render(self, assets: list[str]) -> Iterator[dict | None]:
+        """The messages of all children as they come (see `render_asset`); None once for each asset, its last."""
+        for asset in assets:
+            self.pool.submit(self._render_one, asset)
+        unfinished = len(assets)
+        while unfinished:
+            message = self.messages.get()
+            if message is None:
+                unfinished -= 1
+            yield message
+
+    def _render_one(self, asset: str) -> None:
+        own_cores = self.free_cores.get()
+        out, settings = str(self.out / asset_name(asset)), asdict(self.settings)
+        try:
+            job = {"asset": asset, "out": out, "settings": settings, "cores": own_cores}
+            _run_child(job, self.messages.put, self.running)
+        finally:
+            self.free_cores.put(own_cores)
+            self.messages.put(None)
 
 
 def render_shots(
     asset: str,
     folder: Path,
     setup: str,
-    settings: Settings | None = None,
+    settings: RenderSettings | None = None,
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Sequence:
     """One clip of one asset (a file or "zoo:SEED") into exactly `folder`, in a child process: the views of
     the setup or rig `setup`, and `settings.targets` held-out views a frame (rig "target"). Returns the
     Sequence; raises InputError with the sentence that says what went wrong."""
-    settings = Settings(**{**asdict(settings or Settings(targets=1)), "rig": setup})
-    if settings.clip == ALL:
+    settings = RenderSettings(**{**asdict(settings or RenderSettings(targets=1)), "rig": setup})
+    if settings.clip == ALL_CLIPS:
         raise InputError("--clip all: one clip is wanted here; give its name, first or most-moving.")
     errors, images = [], 0
 
-    def on(message: dict) -> None:
+    def receive(message: dict) -> None:
         nonlocal images
         if "error" in message:
             errors.append(message["error"])
@@ -153,26 +151,10 @@ def render_shots(
             progress(images, message["of"])
 
     job = {"asset": str(asset), "folder": str(folder), "settings": asdict(settings), "cores": []}
-    _child(job, on, set())
+    _run_child(job, receive, set())
     if errors:
         raise InputError(errors[0])
     return read_sequence(Path(folder))
-
-
-def expand(assets: list[str]) -> list[str]:
-    """Folders -> the assets in them, sorted; files and "zoo:SEED" stay. InputError for an empty folder."""
-    found = []
-    for asset in map(str, assets):
-        path = Path(asset)
-        if path.is_dir():
-            files = [Path(root, name) for root, _, names in os.walk(path) for name in names]
-            inside = sorted(str(f) for f in files if f.suffix.lower() in ASSET_SUFFIXES)
-            if not inside:
-                raise InputError(f"{path}: there is no asset in this folder; {', '.join(ASSET_SUFFIXES)} are read.")
-            found += inside
-        else:
-            found.append(asset)
-    return list(dict.fromkeys(found))
 
 
 def cores() -> list[int]:
@@ -182,56 +164,24 @@ def cores() -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def stem(asset: str) -> str:
-    """The name of an asset's folder."""
-    if seed := zoo_seed(asset):
-        return f"zoo-{int(seed):06d}"
-    return Path(asset).stem
-
-
-def zoo_seed(asset: str) -> str | None:
-    """The digits of "zoo:SEED", None for a file."""
-    match = re.fullmatch(r"zoo:(\d+)", asset)
-    return match[1] if match else None
-
-
-def is_made(folder: Path, asset: str, settings: Settings) -> int:
-    """How many clips the run had that made this Sequence, if it is whole and shows this very asset with
-    these settings; else 0."""
-    try:
-        made = read_sequence(folder).provenance
-        same = made["settings"] == asdict(settings) and made["asset"] == Path(asset).name
-        if same and not zoo_seed(asset):
-            same = made["sha256"] == hashlib.sha256(Path(asset).read_bytes()).hexdigest()
-        return made["clips"] if same else 0
-    except (InputError, KeyError, OSError):
-        return 0
-
-
-def _finished(asset: str, folder: Path, settings: Settings) -> list[Path]:
-    """The Sequences of this asset with these settings, if all its clips are there and whole; else none."""
-    folders = [file.parent for file in sorted(folder.glob("*/transforms.json"))]
-    found = {f: clips for f in folders if (clips := is_made(f, asset, settings))}
-    return list(found) if found and len(found) == max(found.values()) else []
-
-
-def _sweep(job: dict) -> None:
-    """Removes what a killed child left half-written: `write_sequence` works in a hidden folder."""
+def _remove_half_written(job: dict) -> None:
+    """Removes what a killed child left behind: `write_sequence` works in a hidden folder."""
     if "folder" in job:
         folder = Path(job["folder"])
-        left = folder.parent.glob(f".{folder.name}.*")
+        hidden = folder.parent.glob(f".{folder.name}.*")
     else:
-        left = Path(job["out"]).glob(".*")
-    for half in left:
-        shutil.rmtree(half, ignore_errors=True)
+        hidden = Path(job["out"]).glob(".*")
+    for path in hidden:
+        shutil.rmtree(path, ignore_errors=True)
 
 
-def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
-    """Runs one job in a child process and passes on its messages; its death is a message too."""
+def _run_child(job: dict, receive: Callable[[dict], None], running: set[subprocess.Popen]) -> None:
+    """Runs one job in a child process, which is in `running` meanwhile, and passes on its messages; its death is a
+    message too."""
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as tmp:
-        file, log = Path(tmp) / "job.json", Path(tmp) / "log"
-        file.write_text(json.dumps(job))
-        command = [sys.executable, "-m", "timesplat.datagen.render_asset", str(file), str(log)]
+        job_file, log = Path(tmp) / "job.json", Path(tmp) / "log"
+        job_file.write_text(json.dumps(job))
+        command = [sys.executable, "-m", "timesplat.datagen.render_asset", str(job_file), str(log)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
         running.add(process)
         said_error = False
@@ -239,18 +189,18 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
             for line in process.stdout:
                 message = json.loads(line)
                 said_error |= "error" in message
-                on(message)
+                receive(message)
             code = process.wait()
         finally:
             process.kill()
             process.wait()
             running.discard(process)
-            _sweep(job)
+            _remove_half_written(job)
         if code and not said_error:
             reason = f"signal {-code}" if code < 0 else f"exit code {code}"
             lines = log.read_text("utf-8", errors="replace").strip().splitlines() if log.exists() else []
             last = f", last line: {lines[-1][:200]}" if lines else ""
-            on({"error": f"{job['asset']}: Blender died on it ({reason}{last}); repair or leave out the file."})
+            receive({"error": f"{job['asset']}: Blender died on it ({reason}{last}); repair or leave out the file."})
 
 
 # ---------------------------------------------------------------- the command line
@@ -258,21 +208,21 @@ def _child(job: dict, on: Callable[[dict], None], running: set) -> None:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `timesplat render`."""
-    d = Settings()
+    defaults = RenderSettings()
     parser.add_argument("assets", nargs="*", metavar="ASSET", help=f"files or folders: {' '.join(ASSET_SUFFIXES)}")
     parser.add_argument("--out", required=True, type=Path, help="folder for the Sequences")
     parser.add_argument("--zoo", metavar="SEEDS", help="also procedural objects, for example 0-99 or 3,7,10-12")
-    parser.add_argument("--rig", default=d.rig, choices=list(RIGS), help="cameras (default: %(default)s)")
-    parser.add_argument("--targets", type=int, default=d.targets, metavar="N", help="held-out views a frame")
-    parser.add_argument("--clip", default=d.clip, help="most-moving (default), first, all, or a clip's name")
-    parser.add_argument("--frames", type=int, default=d.frames, help="length of a clip (%(default)s)")
-    parser.add_argument("--size", type=int, default=d.size, help="pixels (%(default)s)")
-    parser.add_argument("--samples", type=int, default=d.samples, help="samples a pixel (%(default)s)")
+    parser.add_argument("--rig", default=defaults.rig, choices=list(RIGS), help="cameras (default: %(default)s)")
+    parser.add_argument("--targets", type=int, default=defaults.targets, metavar="N", help="held-out views a frame")
+    parser.add_argument("--clip", default=defaults.clip, help="most-moving (default), first, all, or a clip's name")
+    parser.add_argument("--frames", type=int, default=defaults.frames, help="length of a clip (%(default)s)")
+    parser.add_argument("--size", type=int, default=defaults.size, help="pixels (%(default)s)")
+    parser.add_argument("--samples", type=int, default=defaults.samples, help="samples a pixel (%(default)s)")
     parser.add_argument("--no-passes", dest="passes", action="store_false", help="no depth, no motion vectors")
     parser.add_argument("--linear", action="store_true", help="also the scene-linear picture, in the passes' EXR")
     parser.add_argument("--displace", action="store_true", help="still objects, moved a little along a line")
-    parser.add_argument("--seed", type=int, default=d.seed)
-    parser.add_argument("--device", default=d.device, choices=["CPU", "GPU"])
+    parser.add_argument("--seed", type=int, default=defaults.seed)
+    parser.add_argument("--device", default=defaults.device, choices=["CPU", "GPU"])
     parser.add_argument("--jobs", type=int, default=len(cores()), metavar="N", help="assets at a time (%(default)s)")
 
 
@@ -283,7 +233,7 @@ def run(args: argparse.Namespace) -> int:
     assets = [*args.assets, *(f"zoo:{s}" for s in parse_seeds(args.zoo))]
     if not assets:
         raise InputError("render: there is nothing to render; give an asset, a folder, or --zoo 0-9.")
-    settings = Settings(**{name: getattr(args, name) for name in asdict(Settings())})
+    settings = RenderSettings(**{name: getattr(args, name) for name in asdict(RenderSettings())})
     with tqdm(total=0, unit="asset", disable=None) as bar:
 
         def progress(done: int, total: int, images: int) -> None:

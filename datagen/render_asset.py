@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One asset in a process of its own: `python -m timesplat.datagen.render_asset JOB.json LOG`, started by `render`.
+"""One asset in a process of its own: `python -m timesplat.datagen.render_asset JOB.json LOG`, started by `farm`.
 
 The job names the asset, the settings, and where to write; messages go to stdout as JSON lines ({"image": n,
 "of": total}, {"written": folder}, {"warning": …}, {"error": …}), all that Blender prints goes to the log.
+What needs Blender is imported late: it starts its threads, and prints, only after `main` has made ready for that.
 """
 
 from __future__ import annotations
@@ -16,76 +17,101 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from .farm import ALL, FIRST, MOST, Settings, is_made, stem, zoo_seed
+from .render_job import (
+    ALL_CLIPS,
+    FIRST_CLIP,
+    MOST_MOVING_CLIP,
+    RenderSettings,
+    asset_name,
+    rendered_clips,
+    zoo_seed,
+)
 from .rigs import RIGS, targets
 from .sequence import InputError, distinct
 
 
-def run_job(job: dict, say: Callable[[dict], None]) -> None:
-    """Opens the asset and renders each of its clips that the settings choose."""
-    from . import capture, displace, scene
-    from .clips import Clip
-
-    settings, asset = Settings(**job["settings"]), job["asset"]
-    provenance: dict = {"asset": Path(asset).name, **scene.versions()}
-    if seed := zoo_seed(asset):
-        from .zoo import build as zoo
-
-        scene.empty()
-        provenance["zoo"] = zoo.build(int(seed))
-        opened = scene.Asset(Path(asset), "", [Clip("zoo", 1, 24)])
-    else:
-        opened = scene.open_asset(Path(asset))
-        provenance["sha256"] = opened.sha256
+def run_job(job: dict, send: Callable[[dict], None]) -> None:
+    """Opens the asset and renders each of its clips that the settings choose. `job`: "asset" (a file or "zoo:SEED"),
+    "settings" (RenderSettings as a dict), and "out" (a folder for a folder a clip) or "folder" (that of the one clip).
+    Raises InputError."""
+    settings, asset = RenderSettings(**job["settings"]), job["asset"]
+    opened, provenance = _open(asset)
     for warning in opened.warnings:
-        say({"warning": warning})
+        send({"warning": warning})
     if settings.device == "GPU":
         use_gpu()
-    clips = choose(opened, settings)
+    clips = choose_clips(opened, settings)
     provenance |= {"settings": asdict(settings), "clips": len(clips), "warnings": opened.warnings}
-    for slug, clip in _slugs(clips).items():
-        folder = Path(job["folder"]) if "folder" in job else Path(job["out"]) / slug
-        if is_made(folder, asset, settings):  # by a run that was cut off
-            say({"written": str(folder)})
-            continue
-        opened.play(clip)
-        frames = clip.frames(settings.frames)
-        if settings.displace:
-            frames = frames[:1] * settings.frames
-        if not clip.actions:
-            scene.simulate(frames[-1])
-        norm, aabb = scene.normalisation(frames, name=asset)
-        # every clip of every object gets cameras of its own
-        seed = zlib.crc32(f"{settings.seed}/{stem(asset)}/{clip.name}".encode())
-        shift = None
-        if settings.displace:
-            norm, aabb, shift = displace.displacements(norm, aabb, len(frames), seed)
-        numbers = list(range(len(frames)))
-        shots = RIGS[settings.rig](numbers, seed) + targets(numbers, seed, settings.targets)
-        before = 0
+    for name, clip in _folder_names(clips).items():
+        folder = Path(job["folder"]) if "folder" in job else Path(job["out"]) / name
+        if not rendered_clips(folder, asset, settings):  # else it is of a run that was cut off
+            opened.play(clip)
+            _render_clip(clip, asset, folder, settings, provenance, send)
+        send({"written": str(folder)})
 
-        def progress(done: int, total: int) -> None:
-            nonlocal before
-            say({"image": done - before, "of": total})
-            before = done
 
-        capture.capture(
-            shots,
-            folder,
-            frames=frames,
-            normalisation=norm,
-            aabb=aabb,
+def _open(asset: str):
+    """The OpenedAsset, and the beginning of its Sequences' provenance."""
+    from .scene.clips import Clip
+    from .scene.open import OpenedAsset, empty_session, open_asset, tool_versions
+
+    provenance: dict = {"asset": Path(asset).name, **tool_versions()}
+    if seed := zoo_seed(asset):
+        from .zoo.build import build_object
+        from .zoo.puppet import FRAMES
+
+        empty_session()
+        provenance["zoo"] = build_object(int(seed))
+        return OpenedAsset(Path(asset), "", [Clip("zoo", 1, FRAMES)]), provenance
+    opened = open_asset(Path(asset))
+    provenance["sha256"] = opened.sha256
+    return opened, provenance
+
+
+def _render_clip(
+    clip, asset: str, folder: Path, settings: RenderSettings, provenance: dict, send: Callable[[dict], None]
+) -> None:
+    """Renders the clip that the open scene plays into the Sequence `folder`."""
+    from .capture import Subject, capture
+    from .displace import displacements
+    from .render_setup import CaptureSettings
+    from .scene.measure import normalisation
+    from .scene.simulate import simulate
+
+    frames = clip.frames(settings.frames)
+    if settings.displace:
+        frames = frames[:1] * settings.frames
+    if not clip.actions:
+        simulate(frames[-1])
+    norm, aabb = normalisation(frames, name=asset)
+    # every clip of every object gets cameras of its own
+    seed = zlib.crc32(f"{settings.seed}/{asset_name(asset)}/{clip.name}".encode())
+    shift = None
+    if settings.displace:
+        norm, aabb, shift = displacements(norm, aabb, len(frames), seed)
+    numbers = list(range(len(frames)))
+    sent = 0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal sent
+        send({"image": done - sent, "of": total})
+        sent = done
+
+    capture(
+        RIGS[settings.rig](numbers, seed) + targets(numbers, seed, settings.targets),
+        folder,
+        Subject(frames, norm, aabb, shift=shift),
+        CaptureSettings(
             size=settings.size,
             samples=settings.samples,
             passes=settings.passes,
             linear=settings.linear,
             device=settings.device,
             seed=seed % 2**20,
-            shift=shift,
-            provenance=provenance | {"clip": clip.name, "scene_frames": frames, "cameras_seed": seed},
-            progress=progress,
-        )
-        say({"written": str(folder)})
+        ),
+        provenance=provenance | {"clip": clip.name, "scene_frames": frames, "cameras_seed": seed},
+        progress=progress,
+    )
 
 
 def use_gpu() -> None:
@@ -106,16 +132,14 @@ def use_gpu() -> None:
     raise InputError("--device GPU: Cycles finds no graphics card here; render with --device CPU.")
 
 
-def choose(opened, settings: Settings) -> list:
+def choose_clips(opened, settings: RenderSettings) -> list:
     """The clips that `settings.clip` asks for. InputError naming those that exist if there is none such."""
-    from . import scene
-
-    if settings.clip == ALL:
+    if settings.clip == ALL_CLIPS:
         return opened.clips
-    if settings.clip == FIRST:
+    if settings.clip == FIRST_CLIP:
         return opened.clips[:1]
-    if settings.clip == MOST:
-        return [scene.most_moving(opened, settings.frames)]
+    if settings.clip == MOST_MOVING_CLIP:
+        return [most_moving_clip(opened, settings.frames)]
     chosen = [c for c in opened.clips if c.name == settings.clip]
     if not chosen:
         names = ", ".join(c.name for c in opened.clips)
@@ -123,14 +147,29 @@ def choose(opened, settings: Settings) -> list:
     return chosen[:1]
 
 
-def _slugs(clips: list) -> dict:
-    """File name -> clip."""
+def most_moving_clip(opened, count: int = 24):
+    """The clip in whose first `count` frames the vertices move most, judged by six of them."""
+    from .scene.measure import motion
+
+    if len(opened.clips) == 1:
+        return opened.clips[0]
+
+    def amount(clip) -> float:
+        opened.play(clip)
+        frames = clip.frames(count)
+        return motion([frames[round(i * (len(frames) - 1) / 5)] for i in range(6)])
+
+    return max(opened.clips, key=amount)
+
+
+def _folder_names(clips: list) -> dict:
+    """Name of a folder -> clip."""
     plain = [re.sub(r"[^A-Za-z0-9]+", "-", clip.name).strip("-") or "clip" for clip in clips]
     return dict(zip(distinct(plain), clips, strict=True))
 
 
 def main(job_file: str, log: str) -> int:
-    """0 if all is written, 2 after an InputError, 1 after anything else; the reason has been said."""
+    """0 if all is written, 2 after an InputError, 1 after anything else; the reason has been sent."""
     job = json.loads(Path(job_file).read_text())
     out = os.fdopen(os.dup(1), "w", buffering=1)
     sink = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -138,17 +177,20 @@ def main(job_file: str, log: str) -> int:
     os.dup2(sink, 2)
     if job["cores"] and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, job["cores"])  # before Blender starts its threads
-    say = lambda message: print(json.dumps(message), file=out)  # noqa: E731
+
+    def send(message: dict) -> None:
+        print(json.dumps(message), file=out)
+
     try:
-        run_job(job, say)
+        run_job(job, send)
     except InputError as e:
-        say({"error": str(e)})
+        send({"error": str(e)})
         return 2
     except MemoryError:
-        say({"error": f"{job['asset']}: the memory does not suffice; render it smaller or alone."})
+        send({"error": f"{job['asset']}: the memory does not suffice; render it smaller or alone."})
         return 1
     except Exception as e:
-        say({"error": f"{job['asset']}: rendering failed ({type(e).__name__}: {e}); please report it."})
+        send({"error": f"{job['asset']}: rendering failed ({type(e).__name__}: {e}); please report it."})
         return 1
     return 0
 

@@ -14,12 +14,13 @@ import pytest
 
 from timesplat.addon import package, process, runtime
 from timesplat.datagen import render_asset, sequence
-from timesplat.datagen.farm import Settings, render_assets
+from timesplat.datagen.farm import render_assets
+from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.sequence import InputError, move, read_sequence
 from timesplat.model import asset, worker
 
+from .datagen.test_sequence import make as make_sequence
 from .test_asset import make as make_asset
-from .test_sequence import make as make_sequence
 
 
 @pytest.fixture
@@ -163,10 +164,10 @@ def test_the_worker_understands_any_name_on_any_console(tmp_path):
 
 def test_clips_and_assets_that_differ_in_capitals_alone_get_folders_of_their_own(tmp_path):
     clips = [types.SimpleNamespace(name=name) for name in ("Run", "run", "RUN!", "walk")]
-    assert list(render_asset._slugs(clips)) == ["Run", "run-2", "RUN-3", "walk"]
+    assert list(render_asset._folder_names(clips)) == ["Run", "run-2", "RUN-3", "walk"]
     both = [str(tmp_path / folder / name) for folder, name in (("x", "Fox.glb"), ("y", "fox.glb"))]
     said = []
-    render_assets(both, tmp_path / "out", Settings(), report=said.append)
+    render_assets(both, tmp_path / "out", RenderSettings(), report=said.append)
     assert any(s.startswith(f"{both[1]}: it would be written over that of {both[0]}") for s in said)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The zoo: seeded procedural animated objects, training data that needs no licence and no download.
 
-`build(seed)` puts one object into the current, empty scene, moving over frames 1 to 24 at 24 fps. Any
+`build_object(seed)` puts one object into the current, empty scene, moving over frames 1 to 24 at 24 fps. Any
 non-negative integer is a seed, and the same seed gives the same object in every process. By convention
 seeds below `EVALUATION_SEEDS` are for training; evaluation and demonstrations start there.
 
@@ -40,7 +40,7 @@ FAMILIES = {
 }
 
 
-def build(seed: int) -> dict:
+def build_object(seed: int) -> dict:
     """Build the object of this seed into the current scene, which should be empty.
 
     Sets the scene's frame range, rate and current frame. Returns what it is, for provenance: seed,

@@ -9,18 +9,20 @@ import bpy
 import numpy as np
 import pytest
 
-from timesplat.datagen import farm, scene
-from timesplat.datagen.farm import Settings, render_assets, render_shots
+from timesplat.datagen import farm
+from timesplat.datagen.farm import render_assets, render_shots
+from timesplat.datagen.render_job import RenderSettings
+from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, read_sequence
 
-SMALL = Settings(rig="alternating", frames=4, size=24, samples=1)
+SMALL = RenderSettings(rig="alternating", frames=4, size=24, samples=1)
 
 
 @pytest.fixture(scope="module")
 def assets(tmp_path_factory):
     """A folder with a moving cube of two clips, a cube that stands still, and a file that is cut."""
     folder = tmp_path_factory.mktemp("assets")
-    scene.empty()
+    empty_session()
     bpy.ops.mesh.primitive_cube_add()
     ob = bpy.context.object
     for name, way in (("short way", 1), ("long way", 3)):
@@ -110,22 +112,6 @@ def test_the_zoo(tmp_path):
     assert [f.relative_to(tmp_path).as_posix() for f in a] == ["a/zoo-000007/zoo"]
     assert b.provenance["zoo"]["seed"] == 7
     assert all(np.array_equal(read_sequence(a[0]).load_image(i), b.load_image(i)) for i in range(4))
-
-
-def test_folders_may_go_while_assets_are_looked_for(tmp_path, monkeypatch):
-    """Such as the hidden one in which another process renders."""
-    for name in ("a.glb", "b/c.FBX", ".half/d.blend", "b/notes.txt"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    look = os.scandir
-
-    def scandir(path):
-        if os.path.basename(path) == ".half":
-            raise FileNotFoundError(path)
-        return look(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
-    assert farm.expand([str(tmp_path)]) == [str(tmp_path / "a.glb"), str(tmp_path / "b" / "c.FBX")]
 
 
 def test_two_assets_of_one_name(assets, tmp_path):
