@@ -3,7 +3,7 @@
 
 `build_object(seed)` puts one object into the current, empty scene, moving over frames 1 to 24 at 24 fps. Any
 non-negative integer is a seed, and the same seed gives the same object in every process. By convention
-seeds below `EVALUATION_SEEDS` are for training; evaluation and demonstrations start there.
+seeds below `FIRST_EVALUATION_SEED` are for training; evaluation and demonstrations start there.
 
 The whole object is one mesh whose vertex positions are baked into absolute shape keys, one a frame. So
 topology never changes, motion vectors are right for limbs, morphs and turning wheels alike, and what is
@@ -22,11 +22,11 @@ from .shapes import apply, rotation, translation
 from .things import machine, morph, plant, stack, vehicle
 from .walkers import humanoid, walker
 
-EVALUATION_SEEDS = 1_000_000
+FIRST_EVALUATION_SEED = 1_000_000
 # A change to any family that draws other numbers changes what every seed shows.
-FPS = 24
+FRAMES_PER_SECOND = 24
 # How often each family is drawn: characters and animals dominate what people animate.
-FAMILIES = {
+FAMILY_WEIGHTS = {
     walker: 0.24,
     humanoid: 0.2,
     swimmer: 0.13,
@@ -50,7 +50,7 @@ def build_object(seed: int) -> dict:
     _mesh(f"zoo_{seed}", parts, puppet)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, FRAMES
-    scene.render.fps, scene.render.fps_base = FPS, 1.0
+    scene.render.fps, scene.render.fps_base = FRAMES_PER_SECOND, 1.0
     scene.frame_set(1)
     names = [part.name for part in parts]
     return {
@@ -68,8 +68,8 @@ def build_object(seed: int) -> dict:
 def _design(seed: int) -> tuple[Puppet, str]:
     """Everything that is random about an object, before Blender sees it."""
     rng = np.random.default_rng(seed)
-    families = list(FAMILIES)
-    weights = np.array(list(FAMILIES.values()))
+    families = list(FAMILY_WEIGHTS)
+    weights = np.array(list(FAMILY_WEIGHTS.values()))
     family = families[rng.choice(len(families), p=weights / weights.sum())]
     puppet = Puppet(rng)
     family(puppet)
