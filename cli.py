@@ -85,14 +85,14 @@ def _main(argv: list[str] | None) -> int:
 
 
 def render_arguments(p: argparse.ArgumentParser) -> None:
-    from .datagen.render import add_arguments
+    from .datagen.farm import add_arguments
 
     add_arguments(p)
 
 
 def render(args: argparse.Namespace) -> int:
     """Render assets (glTF, FBX, OBJ, USD, .blend, procedural zoo) into Sequences: posed images, depth, motion."""
-    from .datagen.render import run
+    from .datagen.farm import run
 
     return run(args)
 

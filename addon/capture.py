@@ -3,7 +3,7 @@
 objects    full names of what is captured       cameras    full names of cameras, or [] for those of `rig`
 rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
 frames     scene frames                         in_turn    one camera a frame, instead of all of them
-size, samples, passes, lighting                 as `datagen.capture.capture` has them
+size, samples, passes, lighting                 as `datagen.render_setup.CaptureSettings` has them
 sequence   folder to write
 """
 
@@ -15,8 +15,11 @@ import bpy
 import numpy as np
 
 from ..datagen import rigs
-from ..datagen.capture import capture
-from ..datagen.scene import normalisation, simulate, versions
+from ..datagen.capture import Subject, capture
+from ..datagen.render_setup import CaptureSettings
+from ..datagen.scene.measure import normalisation
+from ..datagen.scene.open import tool_versions
+from ..datagen.scene.simulate import simulate
 from ..datagen.sequence import InputError, Normalisation
 from . import beside, process
 
@@ -74,10 +77,10 @@ def _capture(request: dict, progress) -> dict:
     def rendered(done: int, total: int) -> None:
         progress(0.05 + 0.95 * done / total, f"rendering: picture {done} of {total}")
 
-    settings = {key: request[key] for key in ("size", "samples", "passes", "lighting")}
-    settings["provenance"] = {"asset": request["name"], **versions(), "scene_frames": frames}
-    folder = Path(request["sequence"])
-    capture(shots, folder, frames=frames, normalisation=norm, aabb=aabb, objects=objects, progress=rendered, **settings)
+    settings = CaptureSettings(**{key: request[key] for key in ("size", "samples", "passes", "lighting")})
+    subject = Subject(frames, norm, aabb, objects)
+    provenance = {"asset": request["name"], **tool_versions(), "scene_frames": frames}
+    capture(shots, Path(request["sequence"]), subject, settings, provenance=provenance, progress=rendered)
     return {"pictures": len(shots)}
 
 

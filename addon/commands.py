@@ -16,7 +16,7 @@ from pathlib import Path
 import bpy
 
 from ..datagen import rigs
-from ..datagen.scene import object_mode
+from ..datagen.scene.open import enter_object_mode
 from ..datagen.sequence import InputError
 from . import jobs, reconstruct, settings
 from .capture import shoot
@@ -61,7 +61,7 @@ def main(argv: list[str]) -> int:
     window = bpy.context.window_manager.windows[0]
     try:
         with bpy.context.temp_override(window=window):  # a command has none, and operators find no object without
-            object_mode()
+            enter_object_mode()
             _render(chosen, args) if args.command == "render" else _reconstruct(chosen, args)
     except InputError as e:
         print(f"timesplat: {e}", file=sys.stderr)

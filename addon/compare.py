@@ -17,8 +17,9 @@ import numpy as np
 from bpy.props import EnumProperty, IntProperty
 from mathutils import Matrix
 
-from ..datagen import capture
-from ..datagen.scene import borrowed, shown_objects
+from ..datagen.blender_output import read_multilayer, to_straight_srgb
+from ..datagen.render_setup import CaptureSettings, add_even_light, apply_settings, temporary_data
+from ..datagen.scene.borrow import borrowed, shown_objects
 from ..datagen.sequence import InputError
 from . import beside, display, edit, jobs
 
@@ -118,10 +119,10 @@ def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> 
         ob.hide_render = False
         if modifier := display.sampler(ob):
             display.set_input(modifier, "Look", "Splats")
-    with borrowed(objects, lights=not request["even"]) as stage, capture.temporary() as made:
-        capture.render_settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
+    with borrowed(objects, lights=not request["even"]) as stage, temporary_data() as made:
+        apply_settings(stage, CaptureSettings((width, height), samples, passes=False))
         if request["even"]:
-            capture.even_light(stage, made)
+            add_even_light(stage, made)
         stage.render.use_multiview = False
         stage.cycles.transparent_max_bounces = display.TRANSPARENT_BOUNCES
         stage.cycles.min_transparent_bounces = display.TRANSPARENT_BOUNCES  # no roulette: less noise
@@ -134,7 +135,7 @@ def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> 
         stage.render.filepath = str(Path.cwd() / "frame")
         with bpy.context.temp_override(scene=stage):
             bpy.ops.render.render(write_still=True)
-    rgba = capture.straight_srgb(capture.read_multilayer(Path("frame.exr"))["combined"]) / np.float32(255)
+    rgba = to_straight_srgb(read_multilayer(Path("frame.exr"))["combined"]) / np.float32(255)
     return rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
 
 

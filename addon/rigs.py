@@ -9,7 +9,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 from mathutils import Matrix
 
 from ..datagen import rigs
-from ..datagen.scene import normalisation
+from ..datagen.scene.measure import normalisation
 from ..datagen.sequence import InputError
 from . import settings
 

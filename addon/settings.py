@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..datagen.scene import shown_objects
+from ..datagen.scene.borrow import shown_objects
 from ..datagen.sequence import InputError
 from . import display
 

@@ -32,21 +32,27 @@ COLUMNS = ["object", "samples", "seconds", "psnr"]
 
 def measure(asset: str, size: int = 128, samples=SAMPLES, truth: int = TRUTH, frames=FRAMES) -> list[dict]:
     """Rows of COLUMNS of a zoo object. In a process with bpy: it empties the scene."""
-    from timesplat.datagen import capture, scene, zoo
+    from timesplat.datagen.capture import Subject, capture
+    from timesplat.datagen.render_setup import CaptureSettings
     from timesplat.datagen.rigs import RIGS
+    from timesplat.datagen.scene.measure import normalisation
+    from timesplat.datagen.scene.open import empty_session
+    from timesplat.datagen.zoo.build import build_object
 
-    scene.empty()
-    zoo.build(int(asset.removeprefix("zoo:")))
-    normalisation, _ = scene.normalisation(list(range(1, 25)), name=asset)
+    empty_session()
+    build_object(int(asset.removeprefix("zoo:")))
+    norm, _ = normalisation(list(range(1, 25)), name=asset)
+    subject = Subject(list(frames), norm)
     shots = RIGS["default"](range(len(frames)), 0)
 
     def shoot(n: int, seed: int) -> tuple[float, np.ndarray]:
         """-> seconds an image, pictures (V,H,W,3) over white."""
         times = []
         with tempfile.TemporaryDirectory() as folder:
-            seq = capture.capture(
-                shots, Path(folder) / "s", frames=list(frames), normalisation=normalisation, size=size, samples=n,
-                threads=1, seed=seed, progress=lambda done, total: times.append((time.process_time(), done)),
+            settings = CaptureSettings(size=size, samples=n, threads=1, seed=seed)
+            seq = capture(
+                shots, Path(folder) / "s", subject, settings,
+                progress=lambda done, total: times.append((time.process_time(), done)),
             )  # fmt: skip
             pictures = np.stack([seq.load_image(i) for i in range(len(seq.views))]).astype(np.float64) / 255
         (a, first), (b, last) = times[0], times[-1]

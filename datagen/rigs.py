@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-DISTANCE = 2.7
-FOV = 50.0
+DISTANCE = 2.7  # of most cameras from the origin, in normalised units
+FOV = 50.0  # degrees, full field of view
 CANONICAL = {"front": 0.0, "left": 90.0, "back": 180.0, "right": 270.0}  # camera id -> azimuth in degrees
 
 

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .pixels import write_exr
+from .image_files import write_exr
 
 FORMAT = "timesplat-sequence-1"
 
@@ -217,13 +217,13 @@ def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None)
 # ---------------------------------------------------------------- the folder
 
 WINDOWS = os.name == "nt"
-PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds
+_PAUSES_BEFORE_RETRY = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds, see `move`
 
 
 def move(source: str | Path, target: str | Path) -> None:
     """os.replace, within a disk. On Windows nothing can be moved while a program has it open, and a virus scanner opens
     what is new for a moment: there it is tried again for some seconds. Raises OSError."""
-    for pause in PAUSES if WINDOWS else ():
+    for pause in _PAUSES_BEFORE_RETRY if WINDOWS else ():
         with contextlib.suppress(PermissionError):
             return os.replace(source, target)
         time.sleep(pause)

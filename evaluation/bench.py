@@ -122,7 +122,7 @@ def _check(options: BenchOptions) -> None:
 
 def measure(options: BenchOptions, started: float) -> list[str]:
     """Writes bench.csv; -> what could not be rendered."""
-    from ..datagen.render import Settings
+    from ..datagen.render_job import RenderSettings
     from ..model.reconstruct import check_device
     from .bench_summary import bench_row, write_csv
     from .cache import Cache
@@ -133,7 +133,7 @@ def measure(options: BenchOptions, started: float) -> list[str]:
     check_device(options.device)
     chosen = [m.label for m in parse_specs(options.methods)] if options.methods else None
     number = options.objects or (2 if options.quick else None)
-    cache, settings = Cache(options.out), Settings(rig="evaluation", targets=1, size=options.size)
+    cache, settings = Cache(options.out), RenderSettings(rig="evaluation", targets=1, size=options.size)
     sequences, failures = cache.sequences(options.assets or list(HELD_OUT[:number]), settings, options.jobs)
     sequences = dict(list(sequences.items())[:number])
     if not sequences:
@@ -267,7 +267,7 @@ def measure_renderer(path: Path, jobs: int) -> None:
     if path.is_file() or not find_spec("bpy"):
         return
     from ..benchmarks import renderer
-    from ..datagen.render import cores
+    from ..datagen.farm import cores
     from . import charts
 
     rows: list[dict] = []

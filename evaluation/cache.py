@@ -14,7 +14,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
-from ..datagen.render import Settings, render_assets
+from ..datagen.farm import render_assets
+from ..datagen.render_job import RenderSettings
 from ..datagen.sequence import Sequence, read_sequence, sequences_in
 from ..model.gaussians import FIELDS, Gaussians4D, Moving
 
@@ -28,7 +29,9 @@ class Cache:
 
     # ---------------------------------------------------------------- Sequences
 
-    def sequences(self, assets: list[str], settings: Settings, jobs: int) -> tuple[dict[str, Sequence], list[str]]:
+    def sequences(
+        self, assets: list[str], settings: RenderSettings, jobs: int
+    ) -> tuple[dict[str, Sequence], list[str]]:
         """Of files and folders: the finished Sequences in them, and those of assets, rendered where they are not yet,
         by name; and one sentence for each asset that failed."""
         found, others = find_sequences(assets)

@@ -41,7 +41,8 @@ def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
     """The command; save_blend(ply, blend) writes the .blend. Returns 0, raises InputError."""
     from tqdm import tqdm
 
-    from ..datagen.render import Settings, render_shots
+    from ..datagen.farm import render_shots
+    from ..datagen.render_job import RenderSettings
     from ..model.io.asset import write_ply
     from ..model.io.usd_write import write_usd
     from ..model.reconstruct import clip_of
@@ -55,7 +56,7 @@ def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
     clock = time.perf_counter()
-    settings = Settings(targets=1, size=options.size, samples=options.samples)
+    settings = RenderSettings(targets=1, size=options.size, samples=options.samples)
     with tqdm(desc="rendering", unit="image", total=0, disable=None) as bar:
 
         def progress(done: int, total: int) -> None:

@@ -74,7 +74,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def evaluate(options: EvaluateOptions) -> int:
     """The command; 2 where an asset could not be rendered, else 0. Raises InputError."""
-    from ..datagen.render import Settings
+    from ..datagen.render_job import RenderSettings
     from ..model.reconstruct import check_device
     from .cache import Cache, find_sequences
     from .lpips import HINT, find_lpips
@@ -92,7 +92,7 @@ def evaluate(options: EvaluateOptions) -> int:
     setups, sizes = _setups(options.setup), _sizes(options)
     several = len(setups) > 1 or len(sizes) > 1 or options.protocol == "paper"
     rig = "evaluation" if several or setups[0] not in SETUPS else setups[0]
-    settings = Settings(rig=rig, targets=1, size=max(sizes), samples=options.samples, seed=options.seed)
+    settings = RenderSettings(rig=rig, targets=1, size=max(sizes), samples=options.samples, seed=options.seed)
 
     cache, rendered = Cache(options.out), bool(find_sequences(options.assets)[0])
     sequences, failures = cache.sequences(options.assets, settings, options.jobs)

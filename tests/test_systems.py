@@ -13,14 +13,15 @@ from pathlib import Path
 import pytest
 
 from timesplat.addon import package, process, runtime
-from timesplat.datagen import child, sequence
-from timesplat.datagen.render import Settings, render_assets
+from timesplat.datagen import render_asset, sequence
+from timesplat.datagen.farm import render_assets
+from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.sequence import InputError, move, read_sequence
 from timesplat.model import worker
 from timesplat.model.io import asset
 
+from .datagen.test_sequence import make as make_sequence
 from .model.io.test_asset import make as make_asset
-from .test_sequence import make as make_sequence
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_a_sequence_is_open_to_those_to_whom_new_folders_are(tmp_path):
 
 def test_no_temporary_folder_fails_because_a_scanner_holds_a_file_in_it():
     calls, root = [], Path(sequence.__file__).parent.parent
-    for file in [root / "cli.py", *(f for d in ("addon", "datagen", "model") for f in (root / d).glob("*.py"))]:
+    for file in [root / "cli.py", *(f for d in ("addon", "datagen", "model") for f in (root / d).rglob("*.py"))]:
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "tempfile.TemporaryDirectory":
                 calls.append((file.name, {k.arg for k in node.keywords}))
@@ -164,10 +165,10 @@ def test_the_worker_understands_any_name_on_any_console(tmp_path):
 
 def test_clips_and_assets_that_differ_in_capitals_alone_get_folders_of_their_own(tmp_path):
     clips = [types.SimpleNamespace(name=name) for name in ("Run", "run", "RUN!", "walk")]
-    assert list(child._slugs(clips)) == ["Run", "run-2", "RUN-3", "walk"]
+    assert list(render_asset._folder_names(clips)) == ["Run", "run-2", "RUN-3", "walk"]
     both = [str(tmp_path / folder / name) for folder, name in (("x", "Fox.glb"), ("y", "fox.glb"))]
     said = []
-    render_assets(both, tmp_path / "out", Settings(), report=said.append)
+    render_assets(both, tmp_path / "out", RenderSettings(), report=said.append)
     assert any(s.startswith(f"{both[1]}: it would be written over that of {both[0]}") for s in said)
 
 

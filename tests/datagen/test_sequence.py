@@ -2,14 +2,12 @@
 import json
 
 import numpy as np
-import OpenEXR
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from PIL import Image
 
-from timesplat.datagen import pixels, rigs
+from timesplat.datagen import image_files, rigs
 from timesplat.datagen import sequence as sq
 from timesplat.datagen.sequence import InputError, Normalisation, Passes, Sequence, View, sequences_in
 
@@ -23,7 +21,7 @@ def make(folder, frames=3, size=(6, 4), passes=True, provenance=None):
     def fill(tmp):
         for i, v in enumerate(seq.views):
             v.image = f"{i}.png"
-            pixels.write_png(tmp / v.image, rng.integers(0, 256, (h, w, 4), np.uint8))
+            image_files.write_png(tmp / v.image, rng.integers(0, 256, (h, w, 4), np.uint8))
             if passes:
                 v.passes = f"{i}.exr"
                 depth = rng.random((h, w), np.float32) + 2
@@ -74,34 +72,6 @@ def test_normalisation_there_and_back(translation, scale, azimuth, elevation):
     n, c2w = Normalisation(scale, tuple(translation)), rigs.spherical(azimuth, elevation)
     back = n.from_world(n.to_world(c2w))
     assert np.allclose(back, c2w, atol=1e-6) and np.array_equal(back[:3, :3], c2w[:3, :3])
-
-
-shapes = st.tuples(st.integers(1, 40), st.integers(1, 20))
-
-
-@given(hnp.arrays(np.uint8, shapes.map(lambda s: (*s, 4))))
-def test_png_round_trip(tmp_path_factory, rgba):
-    path = tmp_path_factory.getbasetemp() / "x.png"
-    pixels.write_png(path, rgba)
-    with Image.open(path) as im:
-        assert im.mode == "RGBA" and np.array_equal(np.asarray(im), rgba)
-
-
-@given(shapes, st.integers(0, 99), st.booleans())
-def test_exr_is_what_openexr_reads_and_reads_what_it_writes(tmp_path_factory, shape, seed, smooth):
-    path, rng = tmp_path_factory.getbasetemp() / "x.exr", np.random.default_rng(seed)
-    x = np.zeros(shape) if smooth else rng.normal(size=shape)
-    channels = {"B": x.astype(np.float16), "Z": (x * 3).astype(np.float32), "a.b.X": x.astype(np.float32)}
-    pixels.write_exr(path, channels)
-    with OpenEXR.File(str(path), separate_channels=True) as f:
-        assert all(np.array_equal(f.channels()[k].pixels, v) for k, v in channels.items())
-    with pytest.raises(ValueError, match="compressed"):
-        pixels.read_exr(path)
-    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
-    parts = [OpenEXR.Part(dict(header), {k: v}, name=k) for k, v in channels.items()]
-    OpenEXR.File(parts).write(str(path))
-    read = pixels.read_exr(path)
-    assert all(np.array_equal(read[k], v) for k, v in channels.items())
 
 
 # ---------------------------------------------------------------- what can be wrong
@@ -171,7 +141,7 @@ def test_missing_folder_is_named(tmp_path):
 def test_damaged_pictures_are_named(tmp_path):
     seq = make(tmp_path / "a")
     (tmp_path / "a" / "0.png").write_bytes(b"not a png")
-    pixels.write_png(tmp_path / "a" / "1.png", np.zeros((9, 9, 4), np.uint8))
+    image_files.write_png(tmp_path / "a" / "1.png", np.zeros((9, 9, 4), np.uint8))
     (tmp_path / "a" / "2.png").unlink()
     for i, word in enumerate(("cannot be read", "9x9", "missing")):
         with pytest.raises(InputError) as e:
@@ -183,7 +153,7 @@ def test_damaged_passes_are_named(tmp_path):
     seq = make(tmp_path / "a", frames=5)
     folder = tmp_path / "a"
     (folder / "0.exr").write_bytes((folder / "0.exr").read_bytes()[:200])
-    pixels.write_exr(folder / "1.exr", {"Z": np.zeros((4, 6), np.float32)})
+    image_files.write_exr(folder / "1.exr", {"Z": np.zeros((4, 6), np.float32)})
     sq.write_passes(folder / "2.exr", Passes(np.ones((2, 2)), *np.zeros((2, 2, 2, 2))))
     sq.write_passes(folder / "3.exr", Passes(np.full((4, 6), np.nan), *np.zeros((2, 4, 6, 2))))
     (folder / "4.exr").unlink()

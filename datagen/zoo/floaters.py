@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .zoo_puppet import FRAMES, TAU, Puppet, squash
-from .zoo_shapes import X, Y, Z, rotation, scaling, sheet, translation, tube
-from .zoo_walkers import head, nod, tail
+from .puppet import FRAMES, TAU, Puppet, squash
+from .shapes import X, Y, Z, rotation, scaling, sheet, translation, tube
+from .walkers import head, nod, tail
 
 
 def swimmer(p: Puppet):
@@ -103,6 +103,19 @@ def flyer(p: Puppet):
         tail(p, body, (0, long * 0.9, 0), p.u(0.4, 0.9), 0.02)
     else:
         head(p, neck, size)
+    paint = _wings(p, kind, body, fat, long)
+    if kind == "bird":
+        s, c = np.meshgrid(np.linspace(0, 1, 5), np.linspace(-1, 1, 5), indexing="ij")
+        fan = np.stack([c * (0.04 + s * p.u(0.03, 0.16)), s * p.u(0.12, 0.4), 0.03 * np.cos(3 * c)], -1)
+        p.add("tail", sheet(fan), paint, p.joint(body, (0, long * 0.85, 0), rotation(X, p.osc(0.3))))
+    if kind in ("bird", "bee", "dragon") and p.chance(0.5):
+        for side in (-1, 1):
+            foot = p.joint(body, (side * fat * 0.5, long * 0.2, -fat * 0.7), rotation(X, p.osc(0.3, side)))
+            p.rod("leg", (0, 0, 0), (0, 0.06, -0.12), 0.02, 0.012, "accent", foot)
+
+
+def _wings(p: Puppet, kind: str, body: int, fat: float, long: float) -> str:
+    """One or two pairs of sheets that beat; returns their paint."""
     span, lobes = p.u(0.45, 0.9), 1
     chords = {"bird": 0.22, "dragon": 0.35, "bee": 0.2, "ray": 1.6 * long, "butterfly": 0.4}
     chord = chords[kind] * p.u(0.75, 1.3)
@@ -131,14 +144,7 @@ def flyer(p: Puppet):
             points = np.stack([side * (out[..., None] + 0 * back), back, up[..., None] + 0 * back], -1)
             at = (side * fat * (0.2 if kind == "ray" else 0.6), -long * 0.1 + lobe * long * 0.4, fat * 0.3)
             p.add("wing", sheet(points), paint, body, at, flat=False)
-    if kind == "bird":
-        s, c = np.meshgrid(np.linspace(0, 1, 5), np.linspace(-1, 1, 5), indexing="ij")
-        fan = np.stack([c * (0.04 + s * p.u(0.03, 0.16)), s * p.u(0.12, 0.4), 0.03 * np.cos(3 * c)], -1)
-        p.add("tail", sheet(fan), paint, p.joint(body, (0, long * 0.85, 0), rotation(X, p.osc(0.3))))
-    if kind in ("bird", "bee", "dragon") and p.chance(0.5):
-        for side in (-1, 1):
-            foot = p.joint(body, (side * fat * 0.5, long * 0.2, -fat * 0.7), rotation(X, p.osc(0.3, side)))
-            p.rod("leg", (0, 0, 0), (0, 0.06, -0.12), 0.02, 0.012, "accent", foot)
+    return paint
 
 
 def monster(p: Puppet):

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 import json
+from dataclasses import replace
 
 import bpy
 import numpy as np
 import pytest
 
-from timesplat.datagen import capture as cp
-from timesplat.datagen import rigs, scene
+from timesplat.datagen import rigs
+from timesplat.datagen.capture import Subject, capture
+from timesplat.datagen.render_setup import CaptureSettings
 from timesplat.datagen.rigs import Shot
+from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, Normalisation
 
 STEP, TURN = np.array([0.11, 0.0, 0.06]), np.radians(6)  # of the plane, per frame
@@ -17,7 +20,7 @@ NORM = Normalisation(1.6, (0.3, 0.1, -0.2))
 @pytest.fixture
 def plane():
     """A checkered 2x2 plane in the XZ plane, facing the front, that moves and turns about its normal."""
-    scene.empty()
+    empty_session()
     bpy.ops.mesh.primitive_plane_add(size=2, rotation=(np.pi / 2, 0, 0))
     ob = bpy.context.object
     ob.data.transform(ob.matrix_world)
@@ -79,7 +82,7 @@ def test_depth_and_motion_are_those_computed_by_hand(plane, tmp_path):
     shots = [Shot(i, "moving", "r", poses[i % 3], 55 - 5 * i) for i in range(4)]
     shots += [Shot(i, "still", "r", poses[1], 60) for i in range(4)]
     width, height = 45, 31
-    seq = cp.capture(shots, tmp_path / "s", frames=frames, normalisation=NORM, size=(width, height), samples=16)
+    seq = capture(shots, tmp_path / "s", Subject(frames, NORM), CaptureSettings(size=(width, height), samples=16))
     assert (seq.width, seq.height, seq.frame_start, seq.frame_end, len(seq.views)) == (45, 31, 0, 3, 8)
     for i, v in enumerate(seq.views):
         p, rgba = seq.load_passes(i), seq.load_image(i)
@@ -104,14 +107,14 @@ def test_depth_and_motion_are_those_computed_by_hand(plane, tmp_path):
 @pytest.mark.parametrize(("frames", "fps"), [([3, 6], 8), ([3, 3], 24), ([3], 24)])
 def test_seconds_are_those_of_the_scene(plane, tmp_path, frames, fps):
     shots = [Shot(i, "c", "r", rigs.spherical(10, 5, 2.2)) for i in range(len(frames))]
-    cp.capture(shots, tmp_path / "s", frames=frames, normalisation=NORM, size=8, samples=1, passes=False)
+    capture(shots, tmp_path / "s", Subject(frames, NORM), CaptureSettings(size=8, samples=1, passes=False))
     told = json.loads((tmp_path / "s" / "transforms.json").read_text())
     assert told["fps"] == fps and [f["seconds"] for f in told["frames"]] == [i / fps for i in range(len(frames))]
 
 
 def test_silhouette_depth_is_never_a_mixture(plane, tmp_path):
     shots = [Shot(0, "a", "r", rigs.spherical(20, 10, 2.6))]
-    seq = cp.capture(shots, tmp_path / "s", frames=[2], normalisation=NORM, size=40, samples=16)
+    seq = capture(shots, tmp_path / "s", Subject([2], NORM), CaptureSettings(size=40, samples=16))
     depth, alpha = seq.load_passes(0).depth, seq.load_image(0)[..., 3]
     edge = (alpha > 0) & (alpha < 255)
     z = expected(seq.views[0], 2, 40, 40, 1)[0]
@@ -121,12 +124,12 @@ def test_silhouette_depth_is_never_a_mixture(plane, tmp_path):
 
 def test_all_cameras_of_a_frame_at_once_are_each_alone(plane, tmp_path):
     shots = rigs.default_rig([0])
-    options = {"frames": [4], "normalisation": NORM, "size": 32, "samples": 64}
-    together = cp.capture(shots, tmp_path / "all", **options)
-    first = cp.capture(shots[:1], tmp_path / "one", **options)
+    options = Subject([4], NORM), CaptureSettings(size=32, samples=64)
+    together = capture(shots, tmp_path / "all", *options)
+    first = capture(shots[:1], tmp_path / "one", *options)
     assert np.array_equal(together.load_image(0), first.load_image(0))  # view 0: to the bit
     for i in (3, 5):
-        alone = cp.capture(shots[i : i + 1], tmp_path / f"{i}", **options)
+        alone = capture(shots[i : i + 1], tmp_path / f"{i}", *options)
         a, b = on_white(together.load_image(i)), on_white(alone.load_image(0))
         assert np.abs(a - b).mean() < 1  # the other views have noise of their own: 0.5, it falls with samples
         p, q = together.load_passes(i), alone.load_passes(0)
@@ -135,15 +138,15 @@ def test_all_cameras_of_a_frame_at_once_are_each_alone(plane, tmp_path):
 
 
 def test_the_same_seed_gives_the_same_pictures(plane, tmp_path):
-    options = {"frames": [4, 5], "normalisation": NORM, "size": 24, "samples": 2, "passes": False}
-    shots = rigs.alternating([0, 1])
-    a, b, c = (cp.capture(shots, tmp_path / str(i), seed=i // 2, **options) for i in range(3))
+    shots, subject = rigs.alternating([0, 1]), Subject([4, 5], NORM)
+    settings = [CaptureSettings(size=24, samples=2, passes=False, seed=seed) for seed in (0, 0, 1)]
+    a, b, c = (capture(shots, tmp_path / str(i), subject, x) for i, x in enumerate(settings))
     assert all(np.array_equal(a.load_image(i), b.load_image(i)) for i in (0, 1))
     assert not np.array_equal(a.load_image(0), c.load_image(0))
 
 
 def test_colour_is_srgb_and_straight(tmp_path):
-    scene.empty()
+    empty_session()
     bpy.ops.mesh.primitive_plane_add(size=1.3, rotation=(np.pi / 2, 0, 0.2))
     material = bpy.data.materials.new("glow")
     tree = material.node_tree
@@ -153,9 +156,8 @@ def test_colour_is_srgb_and_straight(tmp_path):
     tree.links.new(glow.outputs[0], end.inputs[0])
     bpy.context.object.data.materials.append(material)
     bpy.context.scene.view_settings.exposure = 2  # an artist's display settings must not matter
-    seq = cp.capture(
-        rigs.canonical([0])[:1], tmp_path / "s", frames=[1], normalisation=Normalisation(), size=32, linear=True
-    )
+    settings = CaptureSettings(size=32, linear=True)
+    seq = capture(rigs.canonical([0])[:1], tmp_path / "s", Subject([1], Normalisation()), settings)
     rgba = seq.load_image(0)
     want = [255, round(255 * (1.055 * 0.2 ** (1 / 2.4) - 0.055)), round(255 * (1.055 * 0.01 ** (1 / 2.4) - 0.055))]
     covered = rgba[..., 3] > 0
@@ -220,15 +222,11 @@ def test_the_scene_comes_back_exactly(plane, tmp_path, lighting, fail):
             raise StopError
 
     def go():
-        return cp.capture(
+        return capture(
             rigs.alternating([0, 1]),
             tmp_path / "s",
-            frames=[4, 5],
-            normalisation=NORM,
-            size=24,
-            samples=1,
-            lighting=lighting,
-            objects=[plane] if lighting else None,
+            Subject([4, 5], NORM, objects=[plane] if lighting else None),
+            CaptureSettings(size=24, samples=1, lighting=lighting),
             progress=progress,
         )
 
@@ -246,28 +244,37 @@ def test_the_scene_comes_back_exactly(plane, tmp_path, lighting, fail):
 def test_only_the_objects_given_are_seen(plane, tmp_path):
     bpy.ops.mesh.primitive_cube_add(size=40, location=(0, 30, 0))
     wall = bpy.context.object
-    options = {"frames": [0], "normalisation": NORM, "size": 24, "samples": 1, "passes": False}
-    shot = rigs.canonical([0])[:1]
-    both = cp.capture(shot, tmp_path / "a", **options).load_image(0)
-    alone = cp.capture(shot, tmp_path / "b", objects=[plane], **options).load_image(0)
+    settings = CaptureSettings(size=24, samples=1, passes=False)
+    shot, everything = rigs.canonical([0])[:1], Subject([0], NORM)
+    both = capture(shot, tmp_path / "a", everything, settings).load_image(0)
+    alone = capture(shot, tmp_path / "b", Subject([0], NORM, objects=[plane]), settings).load_image(0)
     wall.hide_render = True
-    hidden = cp.capture(shot, tmp_path / "c", **options).load_image(0)
+    hidden = capture(shot, tmp_path / "c", everything, settings).load_image(0)
     assert (both[..., 3] == 255).all() and (alone[..., 3] == 0).any()
     assert np.array_equal(hidden, alone)
 
 
 def test_the_scene_s_own_lights(plane, tmp_path):
-    options = {"frames": [0], "normalisation": NORM, "size": 24, "samples": 1, "passes": False}
-    shot = rigs.canonical([0])[:1]
-    dark = cp.capture(shot, tmp_path / "a", lighting=False, **options).load_image(0)
+    even = CaptureSettings(size=24, samples=1, passes=False)
+    own = replace(even, lighting=False)
+    shot, subject = rigs.canonical([0])[:1], Subject([0], NORM)
+    dark = capture(shot, tmp_path / "a", subject, own).load_image(0)
     bpy.ops.object.light_add(type="SUN", rotation=(np.pi / 2, 0, 0))
-    lit = cp.capture(shot, tmp_path / "b", lighting=False, **options).load_image(0)
+    lit = capture(shot, tmp_path / "b", subject, own).load_image(0)
     assert dark[..., :3].max() < 10 and lit[..., :3].max() > 100
-    a = cp.capture(shot, tmp_path / "c", **options).load_image(0)
+    a = capture(shot, tmp_path / "c", subject, even).load_image(0)
     bpy.context.object.data.energy = 1000
-    assert np.array_equal(a, cp.capture(shot, tmp_path / "d", **options).load_image(0))
+    assert np.array_equal(a, capture(shot, tmp_path / "d", subject, even).load_image(0))
 
 
 def test_nothing_to_render_is_said(plane, tmp_path):
     with pytest.raises(InputError, match=r"no camera.*;.*\.$"):
-        cp.capture([], tmp_path / "s", frames=[1], normalisation=NORM)
+        capture([], tmp_path / "s", Subject([1], NORM))
+
+
+def test_cameras_whose_names_differ_in_signs_alone_get_files_of_their_own(plane, tmp_path):
+    pose = rigs.spherical(10, 5, 2.2)
+    shots = [Shot(1, "a/b", "r", pose), Shot(0, "a:b", "r", pose)]  # named in the order given, written by frame
+    seq = capture(shots, tmp_path / "s", Subject([1, 2], NORM), CaptureSettings(size=8, samples=1))
+    assert [v.image for v in seq.views] == ["images/r_a-b-2_0000.png", "images/r_a-b_0001.png"]
+    assert [v.passes for v in seq.views] == ["passes/r_a-b-2_0000.exr", "passes/r_a-b_0001.exr"]

@@ -9,18 +9,20 @@ import bpy
 import numpy as np
 import pytest
 
-from timesplat.datagen import render, scene
-from timesplat.datagen.render import Settings, render_assets, render_shots
+from timesplat.datagen import farm
+from timesplat.datagen.farm import render_assets, render_shots
+from timesplat.datagen.render_job import RenderSettings
+from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, read_sequence
 
-SMALL = Settings(rig="alternating", frames=4, size=24, samples=1)
+SMALL = RenderSettings(rig="alternating", frames=4, size=24, samples=1)
 
 
 @pytest.fixture(scope="module")
 def assets(tmp_path_factory):
     """A folder with a moving cube of two clips, a cube that stands still, and a file that is cut."""
     folder = tmp_path_factory.mktemp("assets")
-    scene.empty()
+    empty_session()
     bpy.ops.mesh.primitive_cube_add()
     ob = bpy.context.object
     for name, way in (("short way", 1), ("long way", 3)):
@@ -112,22 +114,6 @@ def test_the_zoo(tmp_path):
     assert all(np.array_equal(read_sequence(a[0]).load_image(i), b.load_image(i)) for i in range(4))
 
 
-def test_folders_may_go_while_assets_are_looked_for(tmp_path, monkeypatch):
-    """Such as the hidden one in which another process renders."""
-    for name in ("a.glb", "b/c.FBX", ".half/d.blend", "b/notes.txt"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    look = os.scandir
-
-    def scandir(path):
-        if os.path.basename(path) == ".half":
-            raise FileNotFoundError(path)
-        return look(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
-    assert render.expand([str(tmp_path)]) == [str(tmp_path / "a.glb"), str(tmp_path / "b" / "c.FBX")]
-
-
 def test_two_assets_of_one_name(assets, tmp_path):
     (tmp_path / "still.glb").write_bytes((assets / "still.glb").read_bytes())
     both = [str(assets / "still.glb"), str(tmp_path / "still.glb")]
@@ -153,14 +139,14 @@ def test_a_child_that_dies_is_one_sentence(assets, tmp_path, monkeypatch):
 
 def arguments(*words):
     parser = argparse.ArgumentParser()
-    render.add_arguments(parser)
+    farm.add_arguments(parser)
     return parser.parse_args([str(w) for w in words])
 
 
 def test_the_command_line(assets, tmp_path, capsys):
     small = ["--out", tmp_path, "--size", 24, "--samples", 1, "--frames", 2, "--rig", "random", "--no-passes"]
-    assert render.run(arguments(assets / "still.glb", *small)) == 0
-    assert render.run(arguments(assets / "still.glb", tmp_path / "no.glb", *small)) == 2
+    assert farm.run(arguments(assets / "still.glb", *small)) == 0
+    assert farm.run(arguments(assets / "still.glb", tmp_path / "no.glb", *small)) == 2
     text = capsys.readouterr()
     assert "1 sequences" in text.out and "1 failed" in text.out and "no such file" in text.err
     made = json.loads((tmp_path / "still" / "static" / "transforms.json").read_text())
@@ -173,7 +159,7 @@ def test_the_command_line(assets, tmp_path, capsys):
         [assets, *small, "--samples", 0],
     ):
         with pytest.raises(InputError, match=r"^[^\n]*;[^\n]*\.$"):
-            render.run(arguments(*wrong))
+            farm.run(arguments(*wrong))
 
 
 def test_no_graphics_card_is_said(assets, tmp_path):
@@ -186,4 +172,4 @@ def test_no_graphics_card_is_said(assets, tmp_path):
 
 
 def test_seeds():
-    assert render.parse_seeds("0-3, 7,9-9") == [0, 1, 2, 3, 7, 9] and render.parse_seeds(None) == []
+    assert farm.parse_seeds("0-3, 7,9-9") == [0, 1, 2, 3, 7, 9] and farm.parse_seeds(None) == []

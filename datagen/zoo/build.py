@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The zoo: seeded procedural animated objects, training data that needs no licence and no download.
+"""Builds a procedural object in Blender: its mesh, its motion and its materials.
 
-`build(seed)` puts one object into the current, empty scene, moving over frames 1 to 24 at 24 fps. Any
+`build_object(seed)` puts one object into the current, empty scene, moving over frames 1 to 24 at 24 fps. Any
 non-negative integer is a seed, and the same seed gives the same object in every process. By convention
-seeds below `EVALUATION_SEEDS` are for training; evaluation and demonstrations start there.
+seeds below `FIRST_EVALUATION_SEED` are for training; evaluation and demonstrations start there.
 
 The whole object is one mesh whose vertex positions are baked into absolute shape keys, one a frame. So
 topology never changes, motion vectors are right for limbs, morphs and turning wheels alike, and what is
@@ -16,17 +16,17 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from .zoo_floaters import flyer, monster, swimmer
-from .zoo_puppet import FRAMES, TAU, Paint, Puppet
-from .zoo_shapes import apply, rotation, translation
-from .zoo_things import machine, morph, plant, stack, vehicle
-from .zoo_walkers import humanoid, walker
+from .floaters import flyer, monster, swimmer
+from .puppet import FRAMES, TAU, Paint, Puppet
+from .shapes import apply, rotation, translation
+from .things import machine, morph, plant, stack, vehicle
+from .walkers import humanoid, walker
 
-EVALUATION_SEEDS = 1_000_000
+FIRST_EVALUATION_SEED = 1_000_000
 # A change to any family that draws other numbers changes what every seed shows.
-FPS = 24
+FRAMES_PER_SECOND = 24
 # How often each family is drawn: characters and animals dominate what people animate.
-FAMILIES = {
+FAMILY_WEIGHTS = {
     walker: 0.24,
     humanoid: 0.2,
     swimmer: 0.13,
@@ -40,21 +40,21 @@ FAMILIES = {
 }
 
 
-def build(seed: int) -> dict:
+def build_object(seed: int) -> dict:
     """Build the object of this seed into the current scene, which should be empty.
 
     Sets the scene's frame range, rate and current frame. Returns what it is, for provenance: seed,
     family, motions, the parts' names with their number, vertices, frames, and whether it is still."""
     puppet, family = _design(seed)
     parts = puppet.finish()
-    _mesh(f"zoo_{seed}", parts, puppet)
+    _add_mesh(f"zoo_{seed}", parts, puppet)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, FRAMES
-    scene.render.fps, scene.render.fps_base = FPS, 1.0
+    scene.render.fps, scene.render.fps_base = FRAMES_PER_SECOND, 1.0
     scene.frame_set(1)
     names = [part.name for part in parts]
     return {
-        "generator": "timesplat.datagen.zoo",
+        "generator": "timesplat.datagen.zoo",  # a name that data sets bear, whatever this file is called
         "seed": int(seed),
         "family": family,
         "motions": puppet.motions,
@@ -68,8 +68,8 @@ def build(seed: int) -> dict:
 def _design(seed: int) -> tuple[Puppet, str]:
     """Everything that is random about an object, before Blender sees it."""
     rng = np.random.default_rng(seed)
-    families = list(FAMILIES)
-    weights = np.array(list(FAMILIES.values()))
+    families = list(FAMILY_WEIGHTS)
+    weights = np.array(list(FAMILY_WEIGHTS.values()))
     family = families[rng.choice(len(families), p=weights / weights.sum())]
     puppet = Puppet(rng)
     family(puppet)
@@ -106,7 +106,7 @@ def _roam(p: Puppet, rooted: bool):
     p.warps.append(lambda points: apply(heading @ centre @ motion @ np.linalg.inv(centre), points))
 
 
-def _mesh(name: str, parts: list, puppet: Puppet):
+def _add_mesh(name: str, parts: list, puppet: Puppet):
     """One mesh object with a shape key a frame, played by its evaluation time."""
     starts = np.cumsum([0] + [len(part.rest) for part in parts])
     rest = np.concatenate([part.rest for part in parts])
@@ -124,7 +124,7 @@ def _mesh(name: str, parts: list, puppet: Puppet):
     mesh.polygons.foreach_set("material_index", slots.astype(np.int32))
     mesh.polygons.foreach_set("use_smooth", ~np.repeat([part.flat for part in parts], counts))
     for key in used:
-        mesh.materials.append(_material(f"{name}_{key}", puppet.paints[key]))
+        mesh.materials.append(_new_material(f"{name}_{key}", puppet.paints[key]))
     thing = bpy.data.objects.new(name, mesh)
     bpy.context.scene.collection.objects.link(thing)
     for points in frames:
@@ -134,10 +134,10 @@ def _mesh(name: str, parts: list, puppet: Puppet):
     for frame in (1, FRAMES):
         keys.eval_time = keys.key_blocks[frame - 1].frame
         keys.keyframe_insert("eval_time", frame=frame)
-    _linear(keys.animation_data)
+    _play_evenly(keys.animation_data)
 
 
-def _linear(animation):
+def _play_evenly(animation):
     """Even playback: no easing between the first and the last key."""
     action = animation.action
     # Before 4.4 an action held its curves itself; now they are in the slot's channel bag.
@@ -147,7 +147,7 @@ def _linear(animation):
             point.interpolation = "LINEAR"
 
 
-def _material(name: str, paint: Paint):
+def _new_material(name: str, paint: Paint):
     material = bpy.data.materials.new(name)
     if material.node_tree is None:  # before Blender 5
         material.use_nodes = True
@@ -161,7 +161,7 @@ def _material(name: str, paint: Paint):
         return material
     rest = nodes.new("ShaderNodeAttribute")
     rest.attribute_name = "rest"
-    fac, soft = _pattern(nodes, links, rest.outputs["Vector"], paint)
+    fac, soft = _add_pattern(nodes, links, rest.outputs["Vector"], paint)
     ramp = nodes.new("ShaderNodeValToRGB")
     ramp.color_ramp.interpolation = "LINEAR" if soft else "CONSTANT"
     while len(ramp.color_ramp.elements) < len(colours):
@@ -174,7 +174,7 @@ def _material(name: str, paint: Paint):
     return material
 
 
-def _pattern(nodes, links, rest, paint: Paint):
+def _add_pattern(nodes, links, rest, paint: Paint):
     """The socket of a pattern's value in 0..1, and whether its colours blend."""
     kind, scale = paint.pattern, paint.scale
     if kind in ("gradient", "belly"):

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .zoo_puppet import FRAMES, TAU, Puppet
-from .zoo_shapes import X, Y, Z, blob, lumpy, rotation, sheet, torus, translation, tube
+from .puppet import FRAMES, TAU, Puppet
+from .shapes import X, Y, Z, blob, lumpy, rotation, sheet, torus, translation, tube
 
 
 def walker(p: Puppet):
@@ -100,6 +100,13 @@ def head(p: Puppet, joint: int, size: float, box: bool = False, human: bool = Fa
     skin = p.pick("flesh", "flesh", "skin") if human else p.pick("skin", "skin", "skin", "second")
     p.ball("head", half, skin, joint, (0, 0, 0), power)
     p.eyes(joint, half, power, radius=p.u(0.1, 0.28), spread=p.u(0.3, 0.7), up=p.u(0, 0.6))
+    _muzzle(p, joint, size, half, power, skin, human)
+    _ears(p, joint, size, half, skin, human)
+    _headgear(p, joint, size, half, power, human)
+
+
+def _muzzle(p: Puppet, joint: int, size: float, half: np.ndarray, power: float, skin: str, human: bool):
+    """A snout, a beak, a nose or nothing."""
     front, top = np.array([0, -half[1], 0]), np.array([0, 0, half[2]])
     muzzle = p.rng.uniform()
     if human:
@@ -119,6 +126,10 @@ def head(p: Puppet, joint: int, size: float, box: bool = False, human: bool = Fa
             p.rod("beak", (0, 0, 0), (0, -size * p.u(0.5, 1.2), -size * 0.1), size * 0.3, 0, "accent", beak, 0.2)
     elif muzzle < 0.95:
         p.ball("nose", size * p.u(0.08, 0.25), p.pick("black", "accent", skin), joint, front * 1.05 - top * 0.1)
+
+
+def _ears(p: Puppet, joint: int, size: float, half: np.ndarray, skin: str, human: bool):
+    """Pointed or round ears, horns or nothing."""
     ears = p.rng.uniform() if not human else 1.0
     tilt, long, curl, horn = p.u(0.1, 0.9), size * p.u(0.3, 1.4), p.u(0.6, 1.6), p.pick("light", "dark")
     for side in (-1, 1):
@@ -132,6 +143,11 @@ def head(p: Puppet, joint: int, size: float, box: bool = False, human: bool = Fa
         elif ears < 0.65:
             bones = size * np.array([(side * 0.4, 0, 0.3), (side * 0.2, -0.2, 0.4), (0, -0.3, 0.3)]) * curl
             p.chain("horn", joint, at, bones, [0 * p.t] * 3, X, size * np.array([0.18, 0.13, 0.08, 0.01]), horn)
+
+
+def _headgear(p: Puppet, joint: int, size: float, half: np.ndarray, power: float, human: bool):
+    """Hair, a helmet, a hat, a mane or nothing."""
+    top = np.array([0, 0, half[2]])
     hat = p.rng.uniform()
     hair = p.pick("second", "dark", "accent")
     if human and hat < 0.45:
@@ -187,18 +203,7 @@ def humanoid(p: Puppet):
     chest = p.joint(hips, (0, 0, 0.05), twist)
     soft = not robot and p.chance(0.7)
     clothes, trousers = p.pick("skin", "accent"), p.pick("second", "dark", "skin")
-    if thing:
-        body = np.array([broad * 1.4, broad * 1.3, torso * 0.8])
-        bulk, faces = blob(body, p.u(1.6, 5), p.n)
-        bulk *= 1 + p.u(-0.4, 0.4) * bulk[:, 2:] / torso
-        p.add("body", (lumpy(bulk, p.rng, p.pick(0, 0.06)), faces), "skin", chest, (0, 0, torso * 0.6))
-        p.eyes(chest, body, 2, (0, 0, torso * 0.6), p.u(0.15, 0.25), p.u(0.3, 0.6), p.u(0.0, 0.4))
-    elif robot or p.chance(0.3):
-        p.ball("torso", (broad, broad * 0.65, torso * 0.55), clothes, chest, (0, 0, torso * 0.5), p.u(3, 9))
-    else:
-        girth = broad * np.array([p.u(0.7, 1.1), p.u(0.6, 1.0), 1.0, p.u(0.7, 1.0)])
-        spine = np.stack([np.zeros(4), np.zeros(4), np.linspace(0, torso, 4)], -1)
-        p.add("torso", tube(spine, np.stack([girth, girth * 0.62], -1), Y, p.sides + 2, 0.6), clothes, chest)
+    _torso(p, chest, torso, broad, clothes, thing, robot)
     shoe, splay, fist, glove = p.pick(2, 4), p.u(0.1, 0.35), r * p.u(0.95, 1.4), p.pick("flesh", "light")
     # Turning about X by a positive angle takes what hangs down backwards: knees bend so, elbows do not.
     for side in (-1, 1):
@@ -237,6 +242,22 @@ def humanoid(p: Puppet):
         cape(p, chest, (0, broad * 0.8, torso * 0.9), broad * 1.8, leg + torso * p.u(0.3, 0.8))
     elif p.chance(0.25):
         p.ball("backpack", (broad * 0.8, 0.1, torso * 0.4), "second", chest, (0, broad * 0.8, torso * 0.55), p.u(2, 6))
+
+
+def _torso(p: Puppet, chest: int, torso: float, broad: float, clothes: str, thing: bool, robot: bool):
+    """The body of a thing with its eyes, a box, or a tube with a waist."""
+    if thing:
+        body = np.array([broad * 1.4, broad * 1.3, torso * 0.8])
+        bulk, faces = blob(body, p.u(1.6, 5), p.n)
+        bulk *= 1 + p.u(-0.4, 0.4) * bulk[:, 2:] / torso
+        p.add("body", (lumpy(bulk, p.rng, p.pick(0, 0.06)), faces), "skin", chest, (0, 0, torso * 0.6))
+        p.eyes(chest, body, 2, (0, 0, torso * 0.6), p.u(0.15, 0.25), p.u(0.3, 0.6), p.u(0.0, 0.4))
+    elif robot or p.chance(0.3):
+        p.ball("torso", (broad, broad * 0.65, torso * 0.55), clothes, chest, (0, 0, torso * 0.5), p.u(3, 9))
+    else:
+        girth = broad * np.array([p.u(0.7, 1.1), p.u(0.6, 1.0), 1.0, p.u(0.7, 1.0)])
+        spine = np.stack([np.zeros(4), np.zeros(4), np.linspace(0, torso, 4)], -1)
+        p.add("torso", tube(spine, np.stack([girth, girth * 0.62], -1), Y, p.sides + 2, 0.6), clothes, chest)
 
 
 def cape(p: Puppet, joint: int, at, width: float, length: float):

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .zoo_shapes import apply, blob, lumpy, on_blob, rotation, scaling, spline, translation, tube
+from .shapes import apply, blob, lumpy, on_blob, rotation, scaling, spline, translation, tube
 
-FRAMES = 24
+FRAMES = 24  # of every clip of the zoo
 TAU = 2 * np.pi
 PATTERNS = ("flat", "stripes", "checker", "noise", "patches", "gradient", "spots", "cells", "tiles", "belly")
 
@@ -98,7 +98,15 @@ def palette(rng) -> dict[str, Paint]:
 
 @dataclass
 class Puppet:
-    """Joints, parts and warps of one object under construction; joint 0 is the body's fixed frame."""
+    """Joints, parts and warps of one object under construction; joint 0 is the body's fixed frame.
+
+    rng, u, chance, pick    where all its random numbers come from, and short ways to draw them
+    t                       (F,) time, 0 at the first frame, below 1 at the last
+    still, energy, tempo    whether it holds still; how strong its swings are; swings a clip
+    sides, n                corners of a tube's cross-section, squares along the edge of a ball's grid
+    flat                    faceted instead of smooth
+    paints                  name -> Paint
+    """
 
     rng: np.random.Generator
     rest: list = field(default_factory=lambda: [np.eye(4)])

@@ -4,7 +4,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from timesplat.datagen import capture, displace, rigs, scene
+from timesplat.datagen import displace, rigs
+from timesplat.datagen.capture import Subject, capture
+from timesplat.datagen.render_setup import CaptureSettings
+from timesplat.datagen.scene.measure import normalisation
+from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import Normalisation
 
 BOX = np.array([[-1.0, -0.4, -0.7], [1.0, 0.4, 0.7]])
@@ -29,20 +33,20 @@ def test_a_line_of_small_steps_that_stays_in_its_box(seed, count):
 
 
 def test_moving_the_cameras_shows_what_moving_the_object_shows(tmp_path):
-    scene.empty()
+    empty_session()
     bpy.ops.mesh.primitive_monkey_add(size=1.5, rotation=(0.2, 0, 0.5))
     ob = bpy.context.object
-    norm, box = scene.normalisation([1])
+    norm, box = normalisation([1])
     norm, box, shift = displace.displacements(norm, box, 3, seed=5)
     shots = [s for s in rigs.canonical([0, 1, 2]) if s.camera in ("front", "left")]
-    options = {"normalisation": norm, "size": 40, "samples": 64}
-    by_camera = capture.capture(shots, tmp_path / "a", frames=[1, 1, 1], shift=shift, **options)
+    settings = CaptureSettings(size=40, samples=64)
+    by_camera = capture(shots, tmp_path / "a", Subject([1, 1, 1], norm, shift=shift), settings)
     for frame, d in enumerate(shift):
         ob.location = norm.scale * d
         ob.keyframe_insert("location", frame=frame)
-    again, box_again = scene.normalisation([0, 1, 2])
+    again, box_again = normalisation([0, 1, 2])
     assert np.isclose(again.scale, norm.scale) and np.allclose(box_again, box, atol=1e-5)
-    by_object = capture.capture(shots, tmp_path / "b", frames=[0, 1, 2], **options)
+    by_object = capture(shots, tmp_path / "b", Subject([0, 1, 2], norm), settings)
     for i, view in enumerate(by_camera.views):
         assert np.array_equal(view.c2w, by_object.views[i].c2w)  # the nominal camera
         a, b = (s.load_image(i).astype(float) for s in (by_camera, by_object))

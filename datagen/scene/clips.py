@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 
 import bpy
 
-# modifiers that can move something without any action
-_MOVING = {"MESH_SEQUENCE_CACHE", "NODES", "CLOTH", "SOFT_BODY", "FLUID", "OCEAN", "WAVE", "BUILD", "PARTICLE_SYSTEM"}
+_MOVING_MODIFIERS = {  # those that can move something without any action
+    *("MESH_SEQUENCE_CACHE", "NODES", "CLOTH", "SOFT_BODY", "FLUID", "OCEAN", "WAVE", "BUILD", "PARTICLE_SYSTEM"),
+}
 
 
 @dataclass
@@ -41,15 +42,15 @@ def find_clips(imported: bool) -> list[Clip]:
     clips = [] if imported else _scene_clip()
     if imported:
         clips += _track_clips()
-    in_use = {id_.animation_data.action for id_ in animated_ids() if id_.animation_data.action}
-    in_tracks = {s.action for id_ in animated_ids() for t in id_.animation_data.nla_tracks for s in t.strips}
-    free = [a for a in bpy.data.actions if a not in in_tracks and (imported or a not in in_use)]
-    clips += _action_clips(free)
+    in_use = {id_.animation_data.action for id_ in _animated_ids() if id_.animation_data.action}
+    in_tracks = {s.action for id_ in _animated_ids() for t in id_.animation_data.nla_tracks for s in t.strips}
+    unused = [a for a in bpy.data.actions if a not in in_tracks and (imported or a not in in_use)]
+    clips += _action_clips(unused)
     frame = bpy.context.scene.frame_current
     return clips or [Clip("static", frame, frame)]
 
 
-def animated_ids() -> list:
+def _animated_ids() -> list:
     """Every data-block of the file that carries animation data (objects, shape keys, materials, …)."""
     found = []
     for name in ("objects", "shape_keys", "meshes", "armatures", "materials", "curves", "lattices"):
@@ -59,13 +60,14 @@ def animated_ids() -> list:
 
 
 def _scene_clip() -> list[Clip]:
+    """The scene as it is, where anything in it can move; else none."""
     scene = bpy.context.scene
     moves = any(
         d.animation_data.action or d.animation_data.drivers or any(not t.mute for t in d.animation_data.nla_tracks)
-        for d in animated_ids()
+        for d in _animated_ids()
     ) or any(
         ob.rigid_body
-        or any(m.type in _MOVING for m in ob.modifiers)
+        or any(m.type in _MOVING_MODIFIERS for m in ob.modifiers)
         or any(c.type == "TRANSFORM_CACHE" for c in ob.constraints)
         for ob in scene.objects
     )
@@ -73,8 +75,9 @@ def _scene_clip() -> list[Clip]:
 
 
 def _track_clips() -> list[Clip]:
+    """NLA tracks of one name, whatever they move, are one clip."""
     groups: dict[str, list] = {}
-    for owner in animated_ids():
+    for owner in _animated_ids():
         for track in owner.animation_data.nla_tracks:
             for strip in track.strips:
                 if strip.action:
@@ -120,26 +123,28 @@ def _owners(action) -> list:
 
 
 def _best_owner(kind: str, name: str, curves):
+    """The ID of this kind that the most curves fit, of equals the one of this name; None where none fits."""
     pools = {"OBJECT": bpy.data.objects, "KEY": bpy.data.shape_keys, "MATERIAL": bpy.data.materials}
     pools["ARMATURE"], pools["MESH"] = bpy.data.armatures, bpy.data.meshes
 
     def fit(id_) -> float:
-        good = 0
+        resolved = 0
         for c in curves:
             try:
                 id_.path_resolve(c.data_path)
-                good += 1
+                resolved += 1
             except ValueError:
                 pass
         # every object has a location: of those that resolve all curves the one of that name wins, then
         # one that is animated anyhow
-        return good + 0.5 * (id_.name == name) + 0.25 * bool(id_.animation_data)
+        return resolved + 0.5 * (id_.name == name) + 0.25 * bool(id_.animation_data)
 
     best = max(pools.get(kind, ()), key=fit, default=None)
     return best if best is not None and curves and fit(best) >= 1 else None
 
 
 def _clip(name: str, actions: list) -> Clip:
+    """A clip as long as the longest of its actions."""
     ranges = [action.curve_frame_range for _, action, _ in actions]
     start = math.floor(min(r[0] for r in ranges) + 1e-4)
     return Clip(name, start, max(start, math.ceil(max(r[1] for r in ranges) - 1e-4)), actions)
@@ -165,7 +170,7 @@ def play(clip: Clip, rest: dict) -> None:
     """Makes the open scene show `clip`; see the module's text. The scene as it is needs nothing."""
     if not clip.actions:
         return
-    for id_ in animated_ids():
+    for id_ in _animated_ids():
         for track in id_.animation_data.nla_tracks:
             track.mute, track.is_solo = True, False
         id_.animation_data.action = None

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One asset in a process of its own: `python -m timesplat.datagen.render_asset JOB.json LOG`, started by `farm`.
+
+The job names the asset, the settings, and where to write; messages go to stdout as JSON lines ({"image": n,
+"of": total}, {"written": folder}, {"warning": …}, {"error": …}), all that Blender prints goes to the log.
+What needs Blender is imported late: it starts its threads, and prints, only after `main` has made ready for that.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+from .render_job import (
+    ALL_CLIPS,
+    FIRST_CLIP,
+    MOST_MOVING_CLIP,
+    RenderSettings,
+    asset_name,
+    rendered_clips,
+    zoo_seed,
+)
+from .rigs import RIGS, targets
+from .sequence import InputError, distinct
+
+
+def run_job(job: dict, send: Callable[[dict], None]) -> None:
+    """Opens the asset and renders each of its clips that the settings choose. `job`: "asset" (a file or "zoo:SEED"),
+    "settings" (RenderSettings as a dict), and "out" (a folder for a folder a clip) or "folder" (that of the one clip).
+    Raises InputError."""
+    settings, asset = RenderSettings(**job["settings"]), job["asset"]
+    opened, provenance = _open(asset)
+    for warning in opened.warnings:
+        send({"warning": warning})
+    if settings.device == "GPU":
+        use_gpu()
+    clips = choose_clips(opened, settings)
+    provenance |= {"settings": asdict(settings), "clips": len(clips), "warnings": opened.warnings}
+    for name, clip in _folder_names(clips).items():
+        folder = Path(job["folder"]) if "folder" in job else Path(job["out"]) / name
+        if not rendered_clips(folder, asset, settings):  # else it is of a run that was cut off
+            opened.play(clip)
+            _render_clip(clip, asset, folder, settings, provenance, send)
+        send({"written": str(folder)})
+
+
+def _open(asset: str):
+    """The OpenedAsset, and the beginning of its Sequences' provenance."""
+    from .scene.clips import Clip
+    from .scene.open import OpenedAsset, empty_session, open_asset, tool_versions
+
+    provenance: dict = {"asset": Path(asset).name, **tool_versions()}
+    if seed := zoo_seed(asset):
+        from .zoo.build import build_object
+        from .zoo.puppet import FRAMES
+
+        empty_session()
+        provenance["zoo"] = build_object(int(seed))
+        return OpenedAsset(Path(asset), "", [Clip("zoo", 1, FRAMES)]), provenance
+    opened = open_asset(Path(asset))
+    provenance["sha256"] = opened.sha256
+    return opened, provenance
+
+
+def _render_clip(
+    clip, asset: str, folder: Path, settings: RenderSettings, provenance: dict, send: Callable[[dict], None]
+) -> None:
+    """Renders the clip that the open scene plays into the Sequence `folder`."""
+    from .capture import Subject, capture
+    from .displace import displacements
+    from .render_setup import CaptureSettings
+    from .scene.measure import normalisation
+    from .scene.simulate import simulate
+
+    frames = clip.frames(settings.frames)
+    if settings.displace:
+        frames = frames[:1] * settings.frames
+    if not clip.actions:
+        simulate(frames[-1])
+    norm, aabb = normalisation(frames, name=asset)
+    # every clip of every object gets cameras of its own
+    seed = zlib.crc32(f"{settings.seed}/{asset_name(asset)}/{clip.name}".encode())
+    shift = None
+    if settings.displace:
+        norm, aabb, shift = displacements(norm, aabb, len(frames), seed)
+    numbers = list(range(len(frames)))
+    sent = 0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal sent
+        send({"image": done - sent, "of": total})
+        sent = done
+
+    capture(
+        RIGS[settings.rig](numbers, seed) + targets(numbers, seed, settings.targets),
+        folder,
+        Subject(frames, norm, aabb, shift=shift),
+        CaptureSettings(
+            size=settings.size,
+            samples=settings.samples,
+            passes=settings.passes,
+            linear=settings.linear,
+            device=settings.device,
+            seed=seed % 2**20,
+        ),
+        provenance=provenance | {"clip": clip.name, "scene_frames": frames, "cameras_seed": seed},
+        progress=progress,
+    )
+
+
+def use_gpu() -> None:
+    """Turns on the graphics cards that Cycles finds; the session's preferences are the factory's."""
+    import bpy
+
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for kind in ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI"):
+        try:
+            devices = [d for d in preferences.get_devices_for_type(kind) if d.type == kind]
+        except (ValueError, TypeError):  # not known to this build
+            continue
+        if devices:
+            preferences.compute_device_type = kind
+            for device in devices:
+                device.use = True
+            return
+    raise InputError("--device GPU: Cycles finds no graphics card here; render with --device CPU.")
+
+
+def choose_clips(opened, settings: RenderSettings) -> list:
+    """The clips that `settings.clip` asks for. InputError naming those that exist if there is none such."""
+    if settings.clip == ALL_CLIPS:
+        return opened.clips
+    if settings.clip == FIRST_CLIP:
+        return opened.clips[:1]
+    if settings.clip == MOST_MOVING_CLIP:
+        return [most_moving_clip(opened, settings.frames)]
+    chosen = [c for c in opened.clips if c.name == settings.clip]
+    if not chosen:
+        names = ", ".join(c.name for c in opened.clips)
+        raise InputError(f"{opened.path}: it has no clip named {settings.clip}; it has {names}.")
+    return chosen[:1]
+
+
+def most_moving_clip(opened, count: int = 24):
+    """The clip in whose first `count` frames the vertices move most, judged by six of them."""
+    from .scene.measure import motion
+
+    if len(opened.clips) == 1:
+        return opened.clips[0]
+
+    def amount(clip) -> float:
+        opened.play(clip)
+        frames = clip.frames(count)
+        return motion([frames[round(i * (len(frames) - 1) / 5)] for i in range(6)])
+
+    return max(opened.clips, key=amount)
+
+
+def _folder_names(clips: list) -> dict:
+    """Name of a folder -> clip."""
+    plain = [re.sub(r"[^A-Za-z0-9]+", "-", clip.name).strip("-") or "clip" for clip in clips]
+    return dict(zip(distinct(plain), clips, strict=True))
+
+
+def main(job_file: str, log: str) -> int:
+    """0 if all is written, 2 after an InputError, 1 after anything else; the reason has been sent."""
+    job = json.loads(Path(job_file).read_text())
+    out = os.fdopen(os.dup(1), "w", buffering=1)
+    sink = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(sink, 1)
+    os.dup2(sink, 2)
+    if job["cores"] and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, job["cores"])  # before Blender starts its threads
+
+    def send(message: dict) -> None:
+        print(json.dumps(message), file=out)
+
+    try:
+        run_job(job, send)
+    except InputError as e:
+        send({"error": str(e)})
+        return 2
+    except MemoryError:
+        send({"error": f"{job['asset']}: the memory does not suffice; render it smaller or alone."})
+        return 1
+    except Exception as e:
+        send({"error": f"{job['asset']}: rendering failed ({type(e).__name__}: {e}); please report it."})
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    status = main(*sys.argv[1:])
+    os._exit(status)  # Blender's own way out is slow, and can crash after all is written

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+import bpy
+import numpy as np
+import pytest
+
+from timesplat.datagen.scene.measure import motion, normalisation, vertices_at
+from timesplat.datagen.scene.open import empty_session, open_asset
+from timesplat.datagen.sequence import InputError, Normalisation
+
+from ..helpers import cube, key
+
+
+def test_normalisation_is_over_all_frames(two_clips):
+    asset = open_asset(two_clips)
+    asset.play(next(c for c in asset.clips if c.name == "slide"))
+    norm, box = normalisation([0, 5, 10])  # x: -1..6, y: -1..10, z: -1..1
+    assert norm.scale == pytest.approx(5.5) and norm.translation == pytest.approx((2.5, 4.5, 0))
+    assert np.allclose(box * norm.scale + norm.translation, [[-1, -1, -1], [6, 10, 1]], atol=1e-5)
+    only, _ = normalisation([0], [bpy.data.objects["A"]])
+    assert only == Normalisation(1.0, (0.0, 0.0, 0.0))
+
+
+def test_instances_count_and_hidden_things_do_not():
+    empty_session()
+    inner = bpy.data.collections.new("inner")
+    inner.objects.link(bpy.data.objects.new("part", cube().data))
+    bpy.data.objects.remove(bpy.context.object)
+    for i in range(2):
+        empty = bpy.data.objects.new(f"e{i}", None)
+        empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", inner, (10 * i, 0, 0)
+        bpy.context.collection.objects.link(empty)
+    cube("hidden", (0, 50, 0)).hide_render = True
+    off = bpy.data.collections.new("off")
+    bpy.context.scene.collection.children.link(off)
+    off.objects.link(bpy.data.objects.new("in hidden", inner.objects[0].data))
+    off.objects[0].location, off.hide_render = (0, 0, 99), True
+    norm, _ = normalisation([1])
+    assert norm == Normalisation(6.0, (5.0, 0.0, 0.0))
+
+
+def test_everything_at_one_point_or_nothing_to_see():
+    empty_session()
+    with pytest.raises(InputError, match=r"^x: no mesh is visible.*\.$"):
+        normalisation([1], name="x")
+    cube().scale = (0, 0, 0)
+    with pytest.raises(InputError, match=r"^x: all vertices lie at one point.*\.$"):
+        normalisation([1], name="x")
+
+
+def test_what_is_asked_twice_is_measured_once_and_what_holds_still_moves_by_0():
+    empty_session()
+    key(cube(), "location", {1: (0, 0, 0), 3: (2, 0, 0)})
+    shown = list(vertices_at([1, 3, 3]))
+    assert [[name for name, _ in parts] for parts in shown] == [["Cube"], ["Cube"]]
+    assert np.allclose(shown[1][0][1] - shown[0][0][1], (2, 0, 0))
+    assert motion([3, 3]) == 0 and motion([1, 3]) == pytest.approx(2 / 2)  # the box is 4 long
+
+
+def test_what_only_the_viewport_hides_is_measured_in_both_ways():
+    empty_session()
+    ob = cube()
+    ob.hide_viewport = True
+    for rendered in (True, False):
+        assert normalisation([1], [ob], rendered=rendered)[0] == Normalisation(1.0, (0.0, 0.0, 0.0))
+    assert ob.hide_viewport
