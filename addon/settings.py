@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 
 from ..datagen.scene import shown_objects
 from ..datagen.sequence import InputError
-from . import display
+from .asset import display
 
 RIG = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
 AIM = 24  # frames that "every: automatic" comes near to

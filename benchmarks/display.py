@@ -61,7 +61,7 @@ def median(act) -> float:
 
 
 def frame_changes(ob) -> list[tuple[str, float]]:
-    from timesplat.addon import display
+    from timesplat.addon.asset import display
 
     scene, rows = bpy.context.scene, []
     for look in ("Points", "Splats"):
@@ -122,7 +122,8 @@ def windowed():
 
 def made():
     """The asset's object, beside whatever the start-up scene holds, with the add-on registered."""
-    from timesplat.addon import display, register
+    from timesplat.addon import register
+    from timesplat.addon.asset import display
 
     register()
     return display.add_asset(asset(), "benchmark", look="Points")

@@ -41,8 +41,8 @@ def rooms(name: str) -> set[str]:
 
 
 def test_the_walker_sees_what_it_should():
-    assert "model.asset" in rooms("addon/display.py") and "datagen.rigs" in rooms("addon/rigs.py")
-    assert "addon.display" in rooms("addon/reconstruct.py") and "torch" in imports("model/gaussians.py")
+    assert "model.asset" in rooms("addon/asset/display.py") and "torch" in imports("model/gaussians.py")
+    assert {"addon.asset.display", "addon.settings", "datagen.sequence"} <= rooms("addon/operators/reconstruct.py")
     assert "model.reconstruct" in rooms("model/worker.py")  # inside a function
 
 

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from timesplat.addon import package, process, runtime
+from timesplat.addon import package
+from timesplat.addon.runtime import child_process as process
+from timesplat.addon.runtime import install as runtime
 from timesplat.datagen import child, sequence
 from timesplat.datagen.render import Settings, render_assets
 from timesplat.datagen.sequence import InputError, move, read_sequence
@@ -109,7 +111,7 @@ def test_a_sequence_is_open_to_those_to_whom_new_folders_are(tmp_path):
 
 def test_no_temporary_folder_fails_because_a_scanner_holds_a_file_in_it():
     calls, root = [], Path(sequence.__file__).parent.parent
-    for file in [root / "cli.py", *(f for d in ("addon", "datagen", "model") for f in (root / d).glob("*.py"))]:
+    for file in [root / "cli.py", *(f for d in ("addon", "datagen", "model") for f in (root / d).rglob("*.py"))]:
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "tempfile.TemporaryDirectory":
                 calls.append((file.name, {k.arg for k in node.keywords}))

@@ -23,7 +23,7 @@ tell()
 """
 CALL = """
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
-tell(code=part("addon.commands").main(sys.argv[2:]))
+tell(code=part("addon.command_line").main(sys.argv[2:]))
 """
 
 
@@ -59,7 +59,7 @@ def test_render(command, tmp_path):
 RESULT = """
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
 ob = bpy.data.objects["Timesplat"]
-tell(kind=ob.type, clouds=part("addon.display").has_point_clouds(),
+tell(kind=ob.type, clouds=part("addon.asset.display").has_point_clouds(),
      active=bpy.context.view_layer.objects.active == ob)
 """
 

@@ -8,7 +8,7 @@ from timesplat.model.asset import Asset, Clip, write_ply
 
 SCENE = """
 part("addon").register()
-display, compare = part("addon.display"), part("addon.compare")
+display, compare = part("addon.asset.display"), part("addon.operators.compare")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene = bpy.context.scene
 bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5, segments=48, ring_count=24)
@@ -30,7 +30,7 @@ camera.location, camera.rotation_euler = (0, -3, 0), (np.pi / 2, 0, 0)
 scene.render.resolution_x, scene.render.resolution_y = 300, 200
 scene.frame_set(7, subframe=0.25)
 def state():
-    look = part("addon.nodes").get_input(display.sampler(ob), "Look")
+    look = part("addon.asset.nodes").get_input(display.sampler(ob), "Look")
     return [scene.frame_current_final, look, scene.render.engine, scene.render.resolution_x, scene.render.filepath,
             scene.render.film_transparent, ball.hide_render, bpy.context.object.name, bpy.context.scene.name,
             *(len(getattr(bpy.data, x)) for x in ("objects", "scenes", "cameras", "lights", "worlds", "meshes"))]
@@ -62,9 +62,9 @@ told["size"] = list(image.size)
 truth, asset, difference = thirds(image)
 told["truth"], told["asset"] = [[at(a, 48, 32), at(a, 4, 4)] for a in (truth, asset)]
 told["gain"] = float(np.abs(difference - np.minimum(4 * np.abs(truth - asset), 1)).max())
-told["said"] = part("addon.jobs").JOBS[-1].message
+told["said"] = part("addon.runtime.jobs").JOBS[-1].message
 told["expected"] = float(-10 * np.log10(np.mean((truth - asset) ** 2)))
-told["left"] = os.listdir(part("addon.preferences").user_folder("runs"))
+told["left"] = os.listdir(part("addon.runtime.worker_options").user_folder("runs"))
 def right():
     bpy.ops.timesplat.compare(size=96, samples=8)
     return at(thirds(bpy.data.images["Timesplat Compare"])[0], 83, 32)

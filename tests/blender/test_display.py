@@ -36,7 +36,7 @@ def shown(ob, *names):
     return {}
 """
 EVALUATE = """
-display, asset = part("addon.display"), part("model.asset").read_ply(sys.argv[1])
+display, asset = part("addon.asset.display"), part("model.asset").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
 scene, out = bpy.context.scene, {}
@@ -45,7 +45,7 @@ for look in ("Points", "Splats"):
     for frame in (10.0, 16.25, 21.5, 32.9, 33.0, 2.0, 40.5):
         scene.frame_set(int(frame), subframe=frame % 1)
         out[f"{look} {frame}"] = shown(ob, "position", "gs_alpha", "radius", "gs_color")
-tell(frames=out, type=ob.type, clouds=part("addon.display").has_point_clouds(), selected=ob.select_get(),
+tell(frames=out, type=ob.type, clouds=part("addon.asset.display").has_point_clouds(), selected=ob.select_get(),
      names=[a.name for a in ob.data.attributes], meshes=len(bpy.data.meshes),
      bounces=scene.cycles.transparent_max_bounces, torch="torch" in sys.modules)
 """
@@ -75,7 +75,7 @@ def test_evaluated_attributes_are_those_of_numpy(blender, tmp_path):
 
 
 SLIDERS = """
-display, nodes = part("addon.display"), part("addon.nodes")
+display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
 asset, cases = part("model.asset").read_ply(sys.argv[1]), json.loads(sys.argv[2])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
@@ -158,7 +158,8 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
     asset = make(200)
     write_ply(tmp_path / "a.ply", asset)
     save = """
-    display, nodes, asset = part("addon.display"), part("addon.nodes"), part("model.asset").read_ply(sys.argv[1])
+    display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
+    asset = part("model.asset").read_ply(sys.argv[1])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     ob = display.add_asset(asset, "a", look="Points", cut=0.05)
     for frame, value in ((10, 0.0), (30, 20.0)):
@@ -187,7 +188,7 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
 
 PANEL = """
 import types
-display, nodes = part("addon.display"), part("addon.nodes")
+display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(part("model.asset").read_ply(sys.argv[1]), "a")
 drawn, buttons, labels = {}, [], []
@@ -239,7 +240,8 @@ def test_the_panel_shows_the_modifiers_own_sliders(blender, tmp_path):
 
 
 NATIVE = """
-display, nodes, asset = part("addon.display"), part("addon.nodes"), part("model.asset").read_ply(sys.argv[1])
+display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
+asset = part("model.asset").read_ply(sys.argv[1])
 if bpy.app.version < (5, 2):
     tell(old=True)
     sys.exit()
@@ -273,7 +275,7 @@ def test_blenders_own_splats_get_the_attributes_that_they_are_known_by(blender, 
 
 
 FOLLOW = """
-display, asset = part("addon.display"), part("model.asset").read_ply(sys.argv[1])
+display, asset = part("addon.asset.display"), part("model.asset").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene, told = bpy.context.scene, {}
 def made(name, parent=None):
@@ -315,7 +317,7 @@ def test_it_follows_an_original_that_stands_still_by_itself(blender, tmp_path):
 
 
 RENDER = """
-from timesplat.addon import display
+from timesplat.addon.asset import display
 display.save_blend(sys.argv[1], sys.argv[2])
 bpy.ops.wm.open_mainfile(filepath=sys.argv[2])
 scene = bpy.context.scene
@@ -376,7 +378,7 @@ def test_splats_are_rendered_as_the_formula_says(blender, tmp_path):
 
 def test_the_clip_is_placed_on_fractional_rates(blender):
     code = """
-    from timesplat.addon.display import play_clip
+    from timesplat.addon.asset.display import play_clip
     from timesplat.model.asset import Clip
     rates = []
     for fps in (24.0, 23.976, 29.97, 12.5, 0.5, 120.0):

@@ -15,7 +15,8 @@ from .test_display import expected_time
 
 START = """
 part("addon").register()
-display, nodes, edit, held = (part(f"addon.{x}") for x in ("display", "nodes", "edit", "held"))
+display, nodes, held = (part(f"addon.asset.{x}") for x in ("display", "nodes", "asset_object"))
+edit = part("addon.operators.edit")
 asset_module = part("model.asset")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 asset, scene = asset_module.read_ply(sys.argv[1]), bpy.context.scene

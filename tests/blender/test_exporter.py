@@ -16,7 +16,7 @@ EXPORT = """
 import atexit
 part("addon").register()
 atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
-display, edit, asset = part("addon.display"), part("addon.edit"), part("model.asset")
+display, edit, asset = part("addon.asset.display"), part("addon.operators.edit"), part("model.asset")
 folder = sys.argv[1] + os.sep
 ob = display.add_asset(asset.read_ply(folder + "in.ply"), "Walk. 1")
 scene = bpy.context.scene
@@ -161,7 +161,7 @@ def at(frames):
         scene.frame_set(f)
         found[f] = [world(), [list(r) for r in ob.matrix_world]]
     return found
-said, operator = [], part("addon.exporter").TIMESPLAT_OT_export_asset
+said, operator = [], part("addon.operators.export_asset").TIMESPLAT_OT_export_asset
 def write(self, *a, before=operator.write):
     said.append(before(self, *a))
     return said[-1]
@@ -179,7 +179,7 @@ display.set_input(modifier, "Time Scale", 1.5)
 def slide(name, values):
     for frame, value in values.items():
         display.set_input(modifier, name, value)
-        owner, key = part("addon.nodes").rna(modifier, name)
+        owner, key = part("addon.asset.nodes").rna(modifier, name)
         owner.keyframe_insert(key, frame=frame)
 slide("Density", {{8: 1.0, 30: 0.4, 36: 0.0}})
 slide("Opacity Cut", {{8: 0.0, 30: 0.3}})
@@ -297,7 +297,7 @@ tell(**result, left=os.listdir(os.environ["TMPDIR"]))
 
 def test_complaints_are_told_and_kept_as_a_text(blender, folder):
     code = """
-exporter = part("addon.exporter")
+exporter = part("addon.operators.export_asset")
 exporter.write_usd = lambda path, *a, **k: path.write_text("x") and ["it is blue", "it is round"]
 tell(done=save("a.usda"), text=bpy.data.texts["Timesplat USD report"].as_string())
 """
@@ -329,7 +329,7 @@ scene.frame_set(21, subframe=0.25)
 told = {"unknown": save("u.usdz", with_original=True)}
 ob["timesplat_source"] = ["Walker", "Gone"]
 told["usdz"], told["usdc"] = save("a.usdz", with_original=True), save("b.usdc", with_original=True)
-exporter = part("addon.exporter")
+exporter = part("addon.operators.export_asset")
 def fails(*a, **k):
     raise part("datagen.sequence").InputError("a.ply: the disk is full; make room.")
 exporter.write_usd = fails
@@ -382,7 +382,7 @@ tell(**told)
 def test_names_follow_the_format(blender, tmp_path):
     code = """
 part("addon").register()
-exporter = part("addon.exporter")
+exporter = part("addon.operators.export_asset")
 menu = [d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs]
 part("addon").unregister()
 f, k = exporter.with_suffix, exporter.kind_of
@@ -394,7 +394,8 @@ tell(names=[f("/x/a", "USDZ"), f("/x/a.ply", "USDC"), f("/x/a.v2", "PLY"), f("/x
     told = blender(code)
     assert told["names"] == ["/x/a.usdz", "/x/a.usdc", "/x/a.v2.ply", "/x/a.v2"] and told["kinds"]
     assert told["typed"] == ["USDZ", "USDA", "USDA", "SLICE", "PLY"]
-    assert "timesplat.addon.exporter" in told["menu"] and "timesplat.addon.exporter" not in told["gone"]
+    module = "timesplat.addon.operators.export_asset"
+    assert module in told["menu"] and module not in told["gone"]
 
 
 def test_installed_as_an_extension(installed, folder):

@@ -17,7 +17,7 @@ IMPORT = """
 import atexit
 part("addon").register()
 atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
-display = part("addon.display")
+display = part("addon.asset.display")
 def load(**options):
     try:
         done = bpy.ops.timesplat.import_asset(**options)
@@ -108,7 +108,7 @@ def test_usd_through_the_worker_and_directly(blender, tmp_path):
         IMPORT
         + """
 from pathlib import Path
-importer, find = part("addon.importer"), importlib.util.find_spec
+importer, find = part("addon.operators.import_asset"), importlib.util.find_spec
 result, named = {}, os.environ["TIMESPLAT_PYTHON"]
 def hidden(name):
     return None if name in ("pxr", "torch") else find(name)
@@ -120,12 +120,12 @@ for key in ["worker", "direct"] if find("pxr") else ["worker"]:
     result[key + "_bad"] = load(filepath=sys.argv[2])
     result[key + "_none"] = load(filepath=sys.argv[2] + "c.usdc")
 os.environ["TIMESPLAT_PYTHON"] = named
-worker = importer.process.ask
+worker = importer.child_process.ask
 def crash(python, request):
     raise part("datagen.sequence").InputError("The process was ended by signal 11: it said nothing")
-importer.process.ask = crash
+importer.child_process.ask = crash
 result["crash"] = load(filepath=sys.argv[1])
-importer.process.ask = worker
+importer.child_process.ask = worker
 os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
 importlib.util.find_spec = hidden
 result["python"] = load(filepath=sys.argv[1])
@@ -203,6 +203,7 @@ def test_menu_and_drop(blender):
          handler=hasattr(bpy.types, "TIMESPLAT_FH_splats"))
     """
     told = blender(code)
-    assert "timesplat.addon.importer" in told["there"] and "timesplat.addon.importer" not in told["gone"]
+    module = "timesplat.addon.operators.import_asset"
+    assert module in told["there"] and module not in told["gone"]
     assert told["suffixes"] == ".ply;.splat;.spz;.usd;.usdc;.usda;.usdz" and told["target"] == "timesplat.import_asset"
     assert {"filepath", "directory", "files"} <= set(told["operator"]) and not told["handler"]

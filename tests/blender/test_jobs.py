@@ -14,7 +14,8 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="lo
 HEAD = """
 import random, shutil, signal, time
 from pathlib import Path
-jobs, process, reconstruct = part("addon.jobs"), part("addon.process"), part("addon.reconstruct")
+jobs, process = part("addon.runtime.jobs"), part("addon.runtime.child_process")
+reconstruct = part("addon.operators.reconstruct")
 scene, chosen = bpy.context.scene, bpy.context.scene.timesplat
 scene.frame_start, scene.frame_end = 1, 6
 chosen.method, chosen.budget, chosen.refine, chosen.size, chosen.samples = "lift", "ALL", 0, 32, 2

@@ -10,7 +10,7 @@ import pytest
 HEAD = """
 import time
 from pathlib import Path
-process = part("addon.process")
+process = part("addon.runtime.child_process")
 folder = Path(sys.argv[1])
 def child(code, request=None):
     return process.Child([sys.argv[2], "-c", code], request or {}, folder)

@@ -83,7 +83,7 @@ def test_a_ball_on_a_line(installed, tmp_path):
 
 
 REFUSED = """
-jobs = part("addon.jobs")
+jobs = part("addon.runtime.jobs")
 errors = {}
 def refused(key, **options):
     try:
@@ -106,7 +106,7 @@ camera.select_set(False)
 ball.hide_render = True
 refused("hidden")
 ball.hide_render = False
-part("addon.beside")._opened()  # as after a file was opened
+part("addon.runtime.background_blender")._opened()  # as after a file was opened
 text = bpy.data.texts.new("guest")
 text.use_module = True
 refused("guest")
@@ -228,8 +228,8 @@ def test_what_the_settings_select(blender):
 
 MEANWHILE = """
 part("addon").register()
-reconstruct, model, jobs = part("addon.reconstruct"), part("model.asset"), part("addon.jobs")
-Vector = part("addon.reconstruct").Matrix.Translation
+reconstruct, model, jobs = part("addon.operators.reconstruct"), part("model.asset"), part("addon.runtime.jobs")
+Vector = part("addon.operators.reconstruct").Matrix.Translation
 begun, results = [], {}
 jobs.start = lambda label, stages, finish, *rest, **named: begun.append(finish)
 folder = reconstruct.Path(sys.argv[1])

@@ -20,7 +20,7 @@ import pytest
 
 from .helpers import ROOT
 
-SCRIPT = ROOT / "addon" / "runtime.py"
+SCRIPT = ROOT / "addon" / "runtime" / "install.py"
 
 
 def load():
@@ -288,7 +288,8 @@ def test_it_needs_what_the_package_says():
 
 ABLE = """
 able = bool(importlib.util.find_spec("ensurepip") or importlib.util.find_spec("pip"))
-preferences, setup, jobs = part("addon.preferences"), part("addon.setup"), part("addon.jobs")
+preferences, jobs = part("addon.runtime.worker_options"), part("addon.runtime.jobs")
+setup = part("addon.operators.runtime_buttons")
 def op(name, **options):
     try:
         return list(getattr(bpy.ops.timesplat, name)(**options))
@@ -296,7 +297,7 @@ def op(name, **options):
         return str(e)
 def left():
     return sorted(x.name for n in ("runs", "runtime") for x in preferences.user_folder(n, create=False).glob("*"))
-process, asked = part("addon.process"), []
+process, asked = part("addon.runtime.child_process"), []
 report = ["ok lift: fine", "ok network: fine"]
 def worker(python, request, folder):
     asked.append([python, request])

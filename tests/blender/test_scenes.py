@@ -19,7 +19,8 @@ from .helpers import CHECKOUT, Runner
 SETUP = """
 import traceback
 part("addon").register()
-settings, reconstruct, capturing = part("addon.settings"), part("addon.reconstruct"), part("addon.capture")
+settings, reconstruct = part("addon.settings"), part("addon.operators.reconstruct")
+capturing = part("addon.runtime.capture")
 InputError, rigs = capturing.InputError, capturing.rigs
 rigs.RIGS["far"] = lambda frames, seed: [rigs.Shot(f, n, "far", rigs.spherical(a, 0, 4)) for f in frames
                                          for n, a in rigs.CANONICAL.items()]

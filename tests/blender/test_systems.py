@@ -4,7 +4,8 @@
 SWEEP = """
 import subprocess
 from types import ModuleType, SimpleNamespace
-jobs, process, preferences = part("addon.jobs"), part("addon.process"), part("addon.preferences")
+jobs, process = part("addon.runtime.jobs"), part("addon.runtime.child_process")
+preferences = part("addon.runtime.worker_options")
 runs = preferences.user_folder("runs")
 here, dead, foreign = os.getpid(), 44444, 55555
 class Winapi(ModuleType):
@@ -47,7 +48,7 @@ def test_what_other_blenders_still_need_is_not_swept(installed):
 
 
 FOLDER = """
-preferences = part("addon.preferences")
+preferences = part("addon.runtime.worker_options")
 before = str(preferences.user_folder("runs"))
 preferences.WINDOWS = True
 os.environ["LOCALAPPDATA"] = sys.argv[1]

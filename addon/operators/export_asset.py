@@ -19,11 +19,12 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..datagen.sequence import InputError
-from ..model import slices, usd
-from ..model.asset import Asset, atomic, write_ply
-from . import display, held, preferences, process
-from .importer import busy
+from ...datagen.sequence import InputError
+from ...model import slices, usd
+from ...model.asset import Asset, atomic, write_ply
+from ..asset import asset_object, display
+from ..runtime import child_process, worker_options
+from .import_asset import busy
 
 REPORT = "Timesplat USD report"
 SUFFIX = {"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz", "SLICE": ".ply", "SPLAT": ".splat"}
@@ -61,9 +62,9 @@ def place(asset: Asset, matrix: np.ndarray) -> Asset:
 def changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
     """Where the object is at each of the frames, (F,4,4), or (1,4,4) where it stands still; and the names of
     the sliders that change."""
-    found = [(np.array(ob.matrix_world), held.sliders(ob))]
-    if held.may_change(ob):
-        found = [(np.array(ob.matrix_world), held.sliders(ob)) for _ in held.steps(frames, context)]
+    found = [(np.array(ob.matrix_world), asset_object.sliders(ob))]
+    if asset_object.may_change(ob):
+        found = [(np.array(ob.matrix_world), asset_object.sliders(ob)) for _ in asset_object.steps(frames, context)]
     first = found[0][1]
     names = [k for k in first if k not in ("Look", "Point Size") and any(s[k] != first[k] for _, s in found)]
     return np.stack([m for m, _ in found]), names
@@ -71,7 +72,7 @@ def changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
 
 def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, motion, context) -> list[str]:
     """Writes and validates; returns what the validators complain about. Raises InputError."""
-    python = preferences.usd_python(context)
+    python = worker_options.usd_python(context)
     if not python:
         usd.write_usd(path, asset, mode=mode, half=half, original=original, motion=motion)
         return usd.check_usd(path)
@@ -83,7 +84,7 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
         if motion is not None:
             request["motion"] = str(Path(folder) / "motion.npy")
             np.save(request["motion"], motion)
-        return process.ask(python, request)["complaints"]
+        return child_process.ask(python, request)["complaints"]
 
 
 @contextmanager
@@ -251,20 +252,20 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         context.view_layer.update()  # a script may have moved it just now
         frame = scene.frame_current_final
         if self.format in ("SLICE", "SPLAT"):
-            part = held.moment(ob, held.asset_of(ob), frame, self.apply_sliders)
+            part = asset_object.moment(ob, asset_object.asset_of(ob), frame, self.apply_sliders)
             count = slices.write_slice(path, part, frame, cut=0)
             if not part.opacity.any():
                 return "WARNING", f"Nothing is shown at frame {frame:g}; one clear Gaussian stands in."
             return "INFO", f"{count} Gaussians of frame {frame:g}."
         if self.format == "SLICES":
-            asset = held.asset_of(ob)
+            asset = asset_object.asset_of(ob)
             frames = range(scene.frame_start, scene.frame_end + 1) if self.apply_sliders else asset.clip.frames
-            steps = held.steps(frames, context)
-            moments = ((f, held.moment(ob, asset, f, self.apply_sliders)) for f in steps)
+            steps = asset_object.steps(frames, context)
+            moments = ((f, asset_object.moment(ob, asset, f, self.apply_sliders)) for f in steps)
             with closing(steps):
                 return "INFO", f"{slices.write_moments(path, moments, path.name, cut=0)} files."
 
-        asset = held.applied(ob) if self.apply_sliders else held.asset_of(ob)
+        asset = asset_object.applied(ob) if self.apply_sliders else asset_object.asset_of(ob)
         now = np.array(ob.matrix_world)
         places, animated = changes(ob, asset.clip.frames, context)
         rest, motion = slices.apart(places)

@@ -24,9 +24,9 @@ import threading
 import time
 from pathlib import Path
 
-from ..datagen.sequence import WINDOWS, InputError
+from ...datagen.sequence import WINDOWS, InputError
 
-PACKAGE = Path(__file__).resolve().parent.parent
+PACKAGE = Path(__file__).resolve().parents[2]
 # Imports this folder as the package `timesplat`, whatever the folder is called, and runs one module of it. (Its
 # parent stays off the path: other extensions live there, with names that could hide real packages.)
 LAUNCH = """

@@ -15,10 +15,12 @@ import bpy
 from bpy.props import StringProperty
 from mathutils import Matrix
 
-from ..datagen.sequence import InputError
-from ..model.asset import read_ply, write_ply
-from . import display, jobs, preferences, process, settings
-from .capture import shoot
+from ...datagen.sequence import InputError
+from ...model.asset import read_ply, write_ply
+from .. import settings
+from ..asset import display
+from ..runtime import child_process, jobs, worker_options
+from ..runtime.capture import shoot
 
 
 class TIMESPLAT_OT_reconstruct(settings.Settings, bpy.types.Operator):
@@ -78,7 +80,7 @@ def request(chosen, context) -> dict:
 
 def start(chosen, context) -> jobs.Job:
     """Starts the Job that these settings ask for. Raises InputError before anything has been done."""
-    python = preferences.worker_python(context)
+    python = worker_options.worker_python(context)
     shot = request(chosen, context)
     checkpoint = bpy.path.abspath(chosen.checkpoint) if getattr(chosen, "checkpoint", "") else ""
     if checkpoint and not Path(checkpoint).is_file():
@@ -88,13 +90,13 @@ def start(chosen, context) -> jobs.Job:
     pixels = expected.pictures * chosen.size**2
     begun = time.monotonic()
 
-    def render(folder: Path) -> process.Child:
+    def render(folder: Path) -> child_process.Child:
         return shoot(shot | {"sequence": str(folder / "sequence")}, folder)
 
-    def reconstruct(folder: Path) -> process.Child:
+    def reconstruct(folder: Path) -> child_process.Child:
         settings.learn(time.monotonic() - begun, pixels, shot["samples"])
         places = {"sequence": str(folder / "sequence"), "asset": str(folder / "asset.ply")}
-        return process.worker(python, asked | places, folder)
+        return child_process.worker(python, asked | places, folder)
 
     # The operator is gone by the time that a stage or the end comes: what they need is taken from it now.
     look = chosen.look
@@ -103,8 +105,8 @@ def start(chosen, context) -> jobs.Job:
         "method": chosen.method,
         "refine": chosen.refine,
         "budget": settings.budget(chosen),
-        "device": preferences.device(context),
-        "checkpoint": checkpoint or preferences.checkpoint(context),
+        "device": worker_options.device(context),
+        "checkpoint": checkpoint or worker_options.checkpoint(context),
     }
     captured = [o for o in settings.objects(chosen, context) if o.type not in ("LIGHT", "CAMERA")]
     known = {o.session_uid for o in captured}  # names may change while it runs

@@ -11,9 +11,9 @@ from bpy.props import EnumProperty, FloatProperty, IntProperty
 from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
-from ..datagen.sequence import InputError
-from . import display, nodes
-from .held import applied, asset_of, in_box, peak, shown, sliders
+from ...datagen.sequence import InputError
+from ..asset import display, nodes
+from ..asset.asset_object import applied, asset_of, in_box, peak, shown, sliders
 
 # ---------------------------------------------------------------- throwing away
 

@@ -24,9 +24,9 @@ import bpy
 from bpy.app.handlers import persistent
 from bpy.props import IntProperty
 
-from ..datagen.sequence import WINDOWS, InputError
-from . import process
-from .preferences import user_folder
+from ...datagen.sequence import WINDOWS, InputError
+from . import child_process
+from .worker_options import user_folder
 
 INTERVAL = 0.25  # seconds between two looks
 KEPT = 8  # Jobs that are listed; older ones that have ended are forgotten
@@ -48,7 +48,7 @@ class Job:
         self._before, self._log, self._event = 0.0, "", {}
         self._partly, self._kept = partly, ""
         self.folder = Path(tempfile.mkdtemp(prefix=f"run-{os.getpid()}-", dir=user_folder("runs")))
-        self.child: process.Child | None = None
+        self.child: child_process.Child | None = None
         try:
             self._next()
         except BaseException:
@@ -126,7 +126,7 @@ class Job:
 
 def start(
     label: str,
-    stages: list[Callable[[Path], process.Child]],
+    stages: list[Callable[[Path], child_process.Child]],
     finish=None,
     shares=None,
     scene: str | None = None,
@@ -385,7 +385,7 @@ def register() -> None:
 
 def unregister() -> None:
     close()
-    process.kill_all()
+    child_process.kill_all()
     if bpy.app.timers.is_registered(_look):
         bpy.app.timers.unregister(_look)
     for keymap, item in _keys:

@@ -20,10 +20,11 @@ import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 from mathutils import Matrix, Quaternion
 
-from ..datagen.sequence import InputError
-from ..model import formats, usd
-from ..model.asset import VISIBLE, read_ply
-from . import display, preferences, process
+from ...datagen.sequence import InputError
+from ...model import formats, usd
+from ...model.asset import VISIBLE, read_ply
+from ..asset import display
+from ..runtime import child_process, worker_options
 
 LOOK_ITEMS = [
     ("Automatic", "Automatic", "Points in the viewport, Splats in renders"),
@@ -50,7 +51,7 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
     (path,) = paths
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the name.")
-    python = preferences.usd_python(context)
+    python = worker_options.usd_python(context)
     if not python:
         asset, motion = usd.read_moving(path)
         return formats.Loaded(asset, "Z"), motion
@@ -58,7 +59,7 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
         try:
-            process.ask(python, request)
+            child_process.ask(python, request)
         except InputError as e:
             if not str(e).startswith("The process "):
                 raise  # it named the file

@@ -13,9 +13,9 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
-from ..datagen.sequence import InputError
-from ..model import slices
-from ..model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, check
+from ...datagen.sequence import InputError
+from ...model import slices
+from ...model.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, check
 from . import display, nodes
 
 FRAME = 1e-3  # frames: sliders are float32, so that a clip's end may miss a whole frame by as much

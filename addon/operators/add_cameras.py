@@ -8,10 +8,10 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 from mathutils import Matrix
 
-from ..datagen import rigs
-from ..datagen.scene import normalisation
-from ..datagen.sequence import InputError
-from . import settings
+from ...datagen import rigs
+from ...datagen.scene import normalisation
+from ...datagen.sequence import InputError
+from .. import settings
 
 RIGS = [
     ("CANONICAL", "Canonical", "Four cameras that stand still: front, left, back, right"),

@@ -18,8 +18,10 @@ import bpy
 from ..datagen import rigs
 from ..datagen.scene import object_mode
 from ..datagen.sequence import InputError
-from . import jobs, reconstruct, settings
-from .capture import shoot
+from . import settings
+from .operators import reconstruct
+from .runtime import jobs
+from .runtime.capture import shoot
 
 SKIPPED = ("look",)  # of no use without a window
 

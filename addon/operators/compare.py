@@ -17,10 +17,12 @@ import numpy as np
 from bpy.props import EnumProperty, IntProperty
 from mathutils import Matrix
 
-from ..datagen import capture
-from ..datagen.scene import borrowed, shown_objects
-from ..datagen.sequence import InputError
-from . import beside, display, edit, jobs
+from ...datagen import capture
+from ...datagen.scene import borrowed, shown_objects
+from ...datagen.sequence import InputError
+from ..asset import display
+from ..runtime import background_blender, jobs
+from . import edit
 
 IMAGE = "Timesplat Compare"
 SPLAT_SAMPLES = 2  # splats are smooth and glow by themselves: more samples change next to nothing
@@ -61,7 +63,9 @@ def start(ob, context, size: int, samples: int) -> jobs.Job:
         show(to_image(np.load(folder / "compared.npy")), bpy.context)
         return f"Original, reconstruction, {GAIN} times the difference: {event['psnr']:.1f} dB PSNR."
 
-    return jobs.start("Compare", [lambda folder: beside.start("addon.compare", request, folder)], finish)
+    return jobs.start(
+        "Compare", [lambda folder: background_blender.start("addon.operators.compare", request, folder)], finish
+    )
 
 
 def _view(context) -> dict:
@@ -248,4 +252,4 @@ def unregister() -> None:
 
 
 if __name__ == "__main__":
-    beside.serve(compare)
+    background_blender.serve(compare)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ..model.asset import SH_C0, VISIBLE
+from ...model.asset import SH_C0, VISIBLE
 
 GROUP = "Timesplat 2"  # the number counts versions of the node group, so that old files keep theirs
 # Blender 5.3 draws point clouds of a type of their own as splats. It takes the attributes scale (σ), rotation and

@@ -15,9 +15,9 @@ from pathlib import Path
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
-from ..datagen.sequence import WINDOWS, InputError
+from ...datagen.sequence import WINDOWS, InputError
 
-ROOT = __package__.rpartition(".")[0]  # what Blender knows the add-on by
+ROOT = __package__.rsplit(".", 2)[0]  # what Blender knows the add-on by
 DEVICES = [
     ("cpu", "CPU", "The processor: runs everywhere"),
     ("cuda", "CUDA", "An NVIDIA GPU; needs a runtime with CUDA"),
@@ -44,14 +44,14 @@ class TIMESPLAT_preferences(bpy.types.AddonPreferences):
     device: EnumProperty(name="Device", description="Where networks and refinement run", items=DEVICES, default="cpu")
 
     def draw(self, context):
-        from . import setup  # it stands above `jobs`, which stands above this
+        from ..operators import runtime_buttons
 
         layout = self.layout
         layout.use_property_split = True
         layout.prop(self, "python")
         layout.prop(self, "checkpoint")
         layout.prop(self, "device")
-        setup.draw(layout)
+        runtime_buttons.draw(layout)
 
 
 def get(context=None):

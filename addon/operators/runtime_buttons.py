@@ -13,8 +13,8 @@ from pathlib import Path
 import bpy
 from bpy.props import EnumProperty
 
-from ..datagen.sequence import InputError
-from . import jobs, preferences, process, runtime
+from ...datagen.sequence import InputError
+from ..runtime import child_process, install, jobs, worker_options
 
 BUILDS = [
     ("cpu", "CPU", "Runs everywhere: about 300 MB to fetch, 1.3 GB on disk"),
@@ -83,7 +83,7 @@ class TIMESPLAT_OT_uninstall_runtime(_Button, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return preferences.runtime() is not None
+        return worker_options.runtime() is not None
 
     def invoke(self, context, event):
         return context.window_manager.invoke_confirm(self, event)
@@ -99,41 +99,41 @@ class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
     bl_label = "Self-Test"
 
     def start(self, context):
-        python, request = preferences.worker_python(context), _test(context)
-        return jobs.start("Self-test", [lambda folder: process.worker(python, request, folder)], _tested)
+        python, request = worker_options.worker_python(context), _test(context)
+        return jobs.start("Self-test", [lambda folder: child_process.worker(python, request, folder)], _tested)
 
 
 def _stage(request: dict):
     """A stage of a Job that runs `runtime` under Blender's own Python."""
-    request = {**request, "folder": str(preferences.runtime_folder())}
-    command = [sys.executable, "-I", "-X", "utf8", str(Path(runtime.__file__))]
-    return lambda folder: process.Child(command, {**request, "work": str(folder)}, folder)
+    request = {**request, "folder": str(worker_options.runtime_folder())}
+    command = [sys.executable, "-I", "-X", "utf8", str(Path(install.__file__))]
+    return lambda folder: child_process.Child(command, {**request, "work": str(folder)}, folder)
 
 
 def _test(context) -> dict:
     """What the worker is asked for. Raises InputError."""
     return {
         "task": "selftest",
-        "device": preferences.device(context),
-        "checkpoint": preferences.checkpoint(context),
+        "device": worker_options.device(context),
+        "checkpoint": worker_options.checkpoint(context),
     }
 
 
-def _test_installed(folder: Path) -> process.Child:
+def _test_installed(folder: Path) -> child_process.Child:
     """The stage after the installation: the self-test of what was installed."""
-    preferences.look_again()
-    python = preferences.runtime_folder() / preferences.runtime()["python"]
-    return process.worker(str(python), _test(bpy.context), folder)
+    worker_options.look_again()
+    python = worker_options.runtime_folder() / worker_options.runtime()["python"]
+    return child_process.worker(str(python), _test(bpy.context), folder)
 
 
 def _installed(event: dict, folder: Path) -> str:
-    told = preferences.runtime()
+    told = worker_options.runtime()
     said = _tested(event, folder)
     return f"Runtime installed: torch {told['versions']['torch']}, {_mega(told['bytes'])} on disk. {said}"
 
 
 def _uninstalled(event: dict, folder: Path) -> str:
-    preferences.look_again()
+    worker_options.look_again()
     return f"Runtime removed: {_mega(event['bytes'])} freed."
 
 
@@ -164,7 +164,7 @@ def draw(layout) -> None:
     """The part of the preferences below the settings; reads no files."""
     box = layout.box()
     box.use_property_split = False
-    told = preferences.runtime()
+    told = worker_options.runtime()
     if told:
         versions = told["versions"]
         text = f"Runtime: torch {versions.get('torch')} ({told['build'].upper()}), {_mega(told['bytes'])}"

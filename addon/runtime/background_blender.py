@@ -21,13 +21,13 @@ from typing import NoReturn
 import bpy
 from bpy.app.handlers import persistent
 
-from ..datagen.sequence import InputError
-from . import process
+from ...datagen.sequence import InputError
+from . import child_process
 
 _at_opening: set[str] | None = None  # the file's texts that run when it is opened, as it was then; None: not known
 
 
-def start(module: str, request: dict, folder: Path) -> process.Child:
+def start(module: str, request: dict, folder: Path) -> child_process.Child:
     """Saves a copy of the open file and of its caches into the folder (nothing of the session changes, not its name
     either) and starts `timesplat.<module>` on it, with the open scene and view layer. Raises InputError where the copy
     cannot be written, or would run a text that was not there when the file was opened: one that was appended, perhaps,
@@ -56,10 +56,10 @@ def start(module: str, request: dict, folder: Path) -> process.Child:
         "scene": bpy.context.scene.name,
         "layer": bpy.context.view_layer.name,
     }
-    code = process.launch(module)
+    code = child_process.launch(module)
     program = bpy.app.binary_path  # empty where Blender is a Python module
     command = [program, "-b", "--factory-startup", "--python-exit-code", "1", "--python-expr", code]
-    return process.Child(command if program else [sys.executable, "-c", code], request, folder)
+    return child_process.Child(command if program else [sys.executable, "-c", code], request, folder)
 
 
 def serve(do: Callable[[dict, Callable], dict]) -> NoReturn:

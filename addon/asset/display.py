@@ -14,7 +14,7 @@ dots, fast; Splats are spheres of three σ whose shader computes gs_alpha · exp
 at which the view ray passes the centre. Custom properties of the object: `timesplat` (1: it is an asset),
 `timesplat_clip` (the Clip), and what others note there (`timesplat_source`: names of the original objects).
 
-    python -m timesplat.addon.display asset.ply asset.blend      writes a .blend to look at
+    python -m timesplat.addon.asset.display asset.ply asset.blend      writes a .blend to look at
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..datagen.rigs import CANONICAL, FOV, spherical
-from ..datagen.sequence import InputError, Normalisation
-from ..model.asset import VISIBLE, Asset, Clip, linear_from_srgb, read_ply, rotation_matrices
+from ...datagen.rigs import CANONICAL, FOV, spherical
+from ...datagen.sequence import InputError, Normalisation
+from ...model.asset import VISIBLE, Asset, Clip, linear_from_srgb, read_ply, rotation_matrices
 from . import nodes
 from .nodes import LOOKS, set_input
 

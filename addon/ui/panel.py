@@ -7,8 +7,10 @@ from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 from bpy.props import EnumProperty
 
-from ..datagen.sequence import InputError
-from . import jobs, preferences, rigs, settings
+from ...datagen.sequence import InputError
+from .. import settings
+from ..operators import add_cameras
+from ..runtime import jobs, worker_options
 
 PRESETS = {  # what they differ in
     "DRAFT": {"size": 64, "samples": 8, "method": "lift", "budget": "ALL", "refine": 0.0},
@@ -85,10 +87,10 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
             about = "at most" if chosen.budget == "NUMBER" else "about"
             col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
-        if not preferences.named(context):
+        if not worker_options.named(context):
             row = layout.row(align=True)
             row.label(text="No runtime yet", icon="ERROR")
-            row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = preferences.ROOT
+            row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = worker_options.ROOT
         row = layout.row()
         row.scale_y = 1.5
         _reconstruct(row, chosen)
@@ -129,7 +131,7 @@ class TIMESPLAT_PT_cameras(_Sidebar, bpy.types.Panel):
         if placed:
             layout.prop(chosen, "in_turn")
         grid = layout.grid_flow(columns=2, align=True, even_columns=True)
-        for key, name, _ in rigs.RIGS:
+        for key, name, _ in add_cameras.RIGS:
             grid.operator("timesplat.add_cameras", text=name).rig = key
 
 
@@ -147,7 +149,7 @@ class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
             layout.prop(chosen, chosen.budget.lower(), text=" ")
         layout.prop(chosen, "look")
         layout.prop(chosen, "output")
-        if mine := preferences.get(context):
+        if mine := worker_options.get(context):
             layout.prop(mine, "checkpoint")
             layout.prop(mine, "device")
 

@@ -14,16 +14,16 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..datagen import rigs
-from ..datagen.capture import capture
-from ..datagen.scene import normalisation, simulate, versions
-from ..datagen.sequence import InputError, Normalisation
-from . import beside, process
+from ...datagen import rigs
+from ...datagen.capture import capture
+from ...datagen.scene import normalisation, simulate, versions
+from ...datagen.sequence import InputError, Normalisation
+from . import background_blender, child_process
 
 
-def shoot(request: dict, folder: Path) -> process.Child:
+def shoot(request: dict, folder: Path) -> child_process.Child:
     """Starts the capture of the open scene. Raises InputError."""
-    return beside.start("addon.capture", request, folder)
+    return background_blender.start("addon.runtime.capture", request, folder)
 
 
 def camera_shots(scene, cameras: list, frames: list[int], norm: Normalisation, in_turn: bool) -> list[rigs.Shot]:
@@ -82,4 +82,4 @@ def _capture(request: dict, progress) -> dict:
 
 
 if __name__ == "__main__":
-    beside.serve(_capture)
+    background_blender.serve(_capture)
