@@ -5,7 +5,8 @@ from importlib import import_module
 
 # In the order in which they are registered; what comes later may use what comes before.
 MODULES = (
-    *("runtime.worker_options", "settings", "operators.import_asset", "runtime.jobs", "operators.runtime_buttons"),
+    *("ui.preferences", "settings", "operators.import_asset", "runtime.jobs", "operators.job_operators"),
+    "operators.runtime_buttons",
     *("operators.add_cameras", "runtime.background_blender", "operators.reconstruct", "command_line"),
     *("ui.panel", "asset.display", "operators.edit", "operators.compare", "operators.export_asset"),
 )

@@ -62,6 +62,31 @@ def test_floors(name):
         assert not any(r.split(".")[0] == "addon" for r in told), "nobody imports the add-on"
 
 
+ADDON = [n for n in NAMES if n.startswith("addon/")]
+# Storeys of the top floor, lowest first: each may use those below it, and its own rooms where that closes no circle.
+STOREYS = ("asset", "runtime", "settings", "operators", "ui")
+ATTIC = ("", "command_line")  # `addon` itself, which registers all of them, and the command line
+
+
+@pytest.mark.parametrize("name", ADDON)
+def test_storeys_of_the_addon(name):
+    def storey(room: str) -> int:
+        first = room.split(".")[1] if "." in room else ""
+        return len(STOREYS) if first in ATTIC else STOREYS.index(first)
+
+    room = name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    if room != "addon.package":  # it runs without Blender, and nobody needs it there
+        assert all(storey(r) <= storey(room) for r in rooms(name) if r.startswith("addon"))
+
+
+def test_no_circle_in_the_addon():
+    """Imports inside functions included."""
+    left = {n.removesuffix(".py").removesuffix("/__init__").replace("/", "."): rooms(n) - {"addon"} for n in ADDON}
+    while free := [room for room, needs in left.items() if not needs & left.keys()]:
+        left = {room: needs for room, needs in left.items() if room not in free}
+    assert left == {}
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_no_torch_near_blender_and_no_blender_near_torch(name):
     top = {m.split(".")[0] for m in imports(name) if not m.startswith(".")}

@@ -14,31 +14,30 @@ import bpy
 from bpy.props import EnumProperty
 
 from ...datagen.sequence import InputError
-from ..runtime import child_process, install, jobs, worker_options
+from ..runtime import child_process, folders, install, jobs, worker_options
 
 BUILDS = [
     ("cpu", "CPU", "Runs everywhere: about 300 MB to fetch, 1.3 GB on disk"),
     ("cuda", "CUDA", "For NVIDIA GPUs: several GB to fetch, more on disk"),
 ]
 OFFLINE = "Online access is off; Preferences > System > Network > Allow Online Access switches it on."
-SHOWN = ("numba", "numpy", "usd-core", "OpenEXR")
-TEXT = "Timesplat self-test"
-_job: jobs.Job | None = None  # the one that was started here last
-_report: list[str] = []  # the lines of the last self-test
+TITLE = "Timesplat self-test"
+last_job: jobs.Job | None = None  # the one that was started here last
+self_test_report: list[str] = []  # the lines of the last self-test
 
 
 class _Button:
     """An operator that starts a Job, and in background stays with it."""
 
     def execute(self, context):
-        global _job
+        global last_job
         try:
             if busy := jobs.running():
                 raise InputError(f"{busy[-1].label} runs; wait for its end, or cancel it.")
-            _job = self.start(context)
+            last_job = self.start(context)
             if bpy.app.background:
-                jobs.wait(_job)
-                self.report({"INFO"}, _job.message)
+                jobs.wait(last_job)
+                self.report({"INFO"}, last_job.message)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
@@ -83,7 +82,7 @@ class TIMESPLAT_OT_uninstall_runtime(_Button, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return worker_options.runtime() is not None
+        return worker_options.installed_runtime() is not None
 
     def invoke(self, context, event):
         return context.window_manager.invoke_confirm(self, event)
@@ -104,8 +103,8 @@ class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
 
 
 def _stage(request: dict):
-    """A stage of a Job that runs `runtime` under Blender's own Python."""
-    request = {**request, "folder": str(worker_options.runtime_folder())}
+    """A stage of a Job that runs `install` under Blender's own Python."""
+    request = {**request, "folder": str(folders.runtime_folder())}
     command = [sys.executable, "-I", "-X", "utf8", str(Path(install.__file__))]
     return lambda folder: child_process.Child(command, {**request, "work": str(folder)}, folder)
 
@@ -121,90 +120,55 @@ def _test(context) -> dict:
 
 def _test_installed(folder: Path) -> child_process.Child:
     """The stage after the installation: the self-test of what was installed."""
-    worker_options.look_again()
-    python = worker_options.runtime_folder() / worker_options.runtime()["python"]
+    worker_options.reload_installed_runtime()
+    python = folders.runtime_folder() / worker_options.installed_runtime()["python"]
     return child_process.worker(str(python), _test(bpy.context), folder)
 
 
 def _installed(event: dict, folder: Path) -> str:
-    told = worker_options.runtime()
-    said = _tested(event, folder)
-    return f"Runtime installed: torch {told['versions']['torch']}, {_mega(told['bytes'])} on disk. {said}"
+    runtime = worker_options.installed_runtime()
+    verdict = _tested(event, folder)
+    return f"Runtime installed: torch {runtime['versions']['torch']}, {megabytes(runtime['bytes'])} on disk. {verdict}"
 
 
 def _uninstalled(event: dict, folder: Path) -> str:
-    worker_options.look_again()
-    return f"Runtime removed: {_mega(event['bytes'])} freed."
+    worker_options.reload_installed_runtime()
+    return f"Runtime removed: {megabytes(event['bytes'])} freed."
 
 
 def _tested(event: dict, folder: Path) -> str:
-    _report[:] = [str(line) for line in event["report"]]
-    text = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
-    text.from_string("\n".join(_report) + "\n")
-    failed = sum(not line.startswith("ok") for line in _report)
+    self_test_report[:] = [str(line) for line in event["report"]]
+    text = bpy.data.texts.get(TITLE) or bpy.data.texts.new(TITLE)
+    text.from_string("\n".join(self_test_report) + "\n")
+    failed = sum(not line.startswith("ok") for line in self_test_report)
     windows = bpy.context.window_manager.windows
     if bpy.app.background:
         print(text.as_string())
     elif not any(area.type == "PREFERENCES" for window in windows for area in window.screen.areas):
         icon = "ERROR" if failed else "CHECKMARK"
-        bpy.context.window_manager.popup_menu(lambda menu, context: _lines(menu.layout), title=TEXT, icon=icon)
+        bpy.context.window_manager.popup_menu(lambda menu, context: draw_report(menu.layout), title=TITLE, icon=icon)
     if failed:
-        raise InputError(f"Self-test: {failed} of {len(_report)} failed; the text {TEXT!r} says what to do.")
-    return f"Self-test: all {len(_report)} passed."
+        raise InputError(f"Self-test: {failed} of {len(self_test_report)} failed; the text {TITLE!r} says what to do.")
+    return f"Self-test: all {len(self_test_report)} passed."
 
 
-def _mega(count: int) -> str:
+def megabytes(count: int) -> str:
+    """Bytes as text, like "500 MB"."""
     return f"{count / 1e6:.0f} MB"
 
 
-# ---------------------------------------------------------------- in the preferences
+# ---------------------------------------------------------------- drawing
 
 
-def draw(layout) -> None:
-    """The part of the preferences below the settings; reads no files."""
-    box = layout.box()
-    box.use_property_split = False
-    told = worker_options.runtime()
-    if told:
-        versions = told["versions"]
-        text = f"Runtime: torch {versions.get('torch')} ({told['build'].upper()}), {_mega(told['bytes'])}"
-        box.label(text=text, icon="CHECKMARK")
-        box.label(text=", ".join(f"{k} {v}" for k, v in versions.items() if k in SHOWN), icon="BLANK1")
-    else:
-        box.label(text="Runtime: not installed", icon="IMPORT")
-        if not bpy.app.online_access:
-            _wrapped(box, OFFLINE, "INTERNET_OFFLINE")
-    row = box.row(align=True)
-    row.operator_context = "INVOKE_DEFAULT"
-    if jobs.running():
-        row.enabled = False
-    row.operator("timesplat.install_runtime", text="Install Again" if told else "Install Runtime", icon="IMPORT")
-    row.operator("timesplat.uninstall_runtime", text="Uninstall", icon="TRASH")
-    row.operator("timesplat.self_test", icon="CHECKMARK")
-    if _job in jobs.JOBS:
-        _progress(box)
-    _lines(box)
-
-
-def _progress(box) -> None:
-    row = box.row(align=True)
-    if _job.state == "running":
-        row.progress(factor=_job.fraction, text=f"{_job.label}: {_job.text}")
-        row.operator("timesplat.cancel", text="", icon="X").number = _job.number
-    else:
-        _wrapped(row, _job.message or _job.text, jobs.ICONS[_job.state])
-        if _job.state == "waiting":
-            row.operator("timesplat.bring", text="", icon="IMPORT").number = _job.number
-    row.operator("timesplat.log", text="", icon="TEXT").number = _job.number
-
-
-def _lines(layout) -> None:
+def draw_report(layout) -> None:
+    """The lines of the last self-test: in the preferences, and where these are closed in a popup."""
     column = layout.column(align=True)
-    for line in _report:
-        _wrapped(column, line.removeprefix("ok "), "CHECKMARK" if line.startswith("ok") else "ERROR")
+    for line in self_test_report:
+        wrapped_label(column, line.removeprefix("ok "), "CHECKMARK" if line.startswith("ok") else "ERROR")
 
 
-def _wrapped(layout, text: str, icon: str) -> None:
+def wrapped_label(layout, text: str, icon: str) -> None:
+    """A label as wide as the region, in as many lines as the text needs; the icon stands before the first."""
     column = layout.column(align=True)
     column.scale_y = 0.8
     region = bpy.context.region  # none in background
@@ -222,8 +186,8 @@ def register() -> None:
 
 
 def unregister() -> None:
-    global _job
-    _job = None
-    _report.clear()
+    global last_job
+    last_job = None
+    self_test_report.clear()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -22,18 +22,16 @@ from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
-from bpy.props import IntProperty
 
 from ...datagen.sequence import WINDOWS, InputError
 from . import child_process
-from .worker_options import user_folder
+from .folders import user_folder
 
 INTERVAL = 0.25  # seconds between two looks
 KEPT = 8  # Jobs that are listed; older ones that have ended are forgotten
 JOBS: list[Job] = []
 _numbers = itertools.count(1)
 _session = 0  # counts the files that were opened
-ICONS = {"waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
 
 
 class Job:
@@ -183,7 +181,7 @@ def _look():
                     bpy.ops.ed.undo_push(message=job.label)
             changed.append(job)
     if changed:
-        _redraw(changed[-1])
+        redraw(changed[-1])
     return INTERVAL if any(job.state in ("running", "waiting") for job in JOBS) else None
 
 
@@ -198,7 +196,8 @@ def _quiet(job: Job) -> bool:
         return bpy.context.mode == "OBJECT" and not any(len(w.modal_operators) for w in windows)
 
 
-def _redraw(job: Job) -> None:
+def redraw(job: Job) -> None:
+    """The status bar, with how far this Job is, and every area that shows Jobs."""
     text = f"Timesplat: {job.text}, {job.fraction:.0%} (Esc over a 3D view cancels)"
     for workspace in bpy.data.workspaces:
         workspace.status_text_set(text if running() else None)
@@ -242,117 +241,6 @@ def _alive(pid: int) -> bool:
     return True
 
 
-# ---------------------------------------------------------------- operators
-
-
-class _OfJob:
-    number: IntProperty(description="The Job's number; 0: the newest", min=0, options={"SKIP_SAVE"})
-
-    def job(self) -> Job | None:
-        return next((j for j in reversed(JOBS) if self.number in (0, j.number)), None)
-
-
-class TIMESPLAT_OT_cancel(_OfJob, bpy.types.Operator):
-    """End what runs, or throw away what waits; the scene is as it was"""
-
-    bl_idname = "timesplat.cancel"
-    bl_label = "Cancel Job"
-
-    @classmethod
-    def poll(cls, context):
-        return any(job.state in ("running", "waiting") for job in JOBS)
-
-    def invoke(self, context, event):
-        if event.type == "ESC":
-            mine = [job for job in running() if job.scene]  # an installation is not ended in passing
-            if not mine or context.screen.is_animation_playing:
-                return {"PASS_THROUGH"}  # Esc means something else then
-            self.number = mine[-1].number
-        return self.execute(context)
-
-    def execute(self, context):
-        job = self.job() if self.number else (running() or JOBS)[-1]
-        if job:
-            job.cancel()
-            _redraw(job)
-            self.report({"INFO"}, f"{job.label}: cancelled.")
-        return {"FINISHED"}
-
-
-class TIMESPLAT_OT_bring(_OfJob, bpy.types.Operator):
-    """Bring the result into this scene"""
-
-    bl_idname = "timesplat.bring"
-    bl_label = "Bring In Result"
-    bl_options = {"UNDO"}  # noqa: RUF012
-
-    @classmethod
-    def poll(cls, context):
-        return context.mode == "OBJECT" and any(job.state == "waiting" for job in JOBS)
-
-    def execute(self, context):
-        job = self.job()
-        if job and job.state == "waiting":
-            job.bring()
-            self.report({"INFO"} if job.state == "done" else {"ERROR"}, job.message)
-        return {"FINISHED"}
-
-
-class TIMESPLAT_OT_log(_OfJob, bpy.types.Operator):
-    """Show the log as a text, in a window of its own"""
-
-    bl_idname = "timesplat.log"
-    bl_label = "Show Log"
-
-    @classmethod
-    def poll(cls, context):
-        return bool(JOBS)
-
-    def execute(self, context):
-        job = self.job()
-        if not job:
-            return {"CANCELLED"}
-        text = bpy.data.texts.get("Timesplat log") or bpy.data.texts.new("Timesplat log")
-        text.from_string(f"{job.label}: {job.message or job.text}\n\n{job.log_text() or 'It said nothing.'}")
-        if not bpy.app.background:
-            show_text(context, text)
-        return {"FINISHED"}
-
-
-def show_text(context, text) -> None:
-    """Opens a text in a window of its own."""
-    bpy.ops.wm.window_new()
-    area = context.window_manager.windows[-1].screen.areas[0]
-    area.type = "TEXT_EDITOR"
-    area.spaces.active.text = text
-
-
-def draw(layout) -> None:
-    """One row a Job, the newest first."""
-    for job in reversed(JOBS):
-        box = layout.column(align=True)
-        row = box.row(align=True)
-        if job.state == "running":
-            row.progress(factor=job.fraction, text=job.text)
-        else:
-            said = job.message if job.state == "done" else f"{job.label}: {job.message or job.text}"
-            row.label(text=said, icon=ICONS[job.state])
-        if job.state == "waiting":
-            row.operator("timesplat.bring", text="", icon="IMPORT").number = job.number
-        row.operator("timesplat.log", text="", icon="TEXT").number = job.number
-        if job.state in ("running", "waiting"):
-            row.operator("timesplat.cancel", text="", icon="X").number = job.number
-        elif job.state == "failed" and len(job.message) > 40:
-            for line in _lines(job.message):
-                box.label(text=line)
-
-
-def _lines(message: str, width: int = 44) -> list[str]:
-    import textwrap
-
-    return textwrap.wrap(message, width)
-
-
 # ---------------------------------------------------------------- with Blender
 
 
@@ -370,17 +258,10 @@ def close() -> None:
 
 
 atexit.register(close)
-CLASSES = (TIMESPLAT_OT_cancel, TIMESPLAT_OT_bring, TIMESPLAT_OT_log)
-_keys: list = []
 
 
 def register() -> None:
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
     bpy.app.handlers.load_post.append(_opened)
-    if keys := bpy.context.window_manager.keyconfigs.addon:  # none in background
-        keymap = keys.keymaps.new(name="3D View", space_type="VIEW_3D")
-        _keys.append((keymap, keymap.keymap_items.new("timesplat.cancel", "ESC", "PRESS")))
 
 
 def unregister() -> None:
@@ -388,9 +269,4 @@ def unregister() -> None:
     child_process.kill_all()
     if bpy.app.timers.is_registered(_look):
         bpy.app.timers.unregister(_look)
-    for keymap, item in _keys:
-        keymap.keymap_items.remove(item)
-    _keys.clear()
     bpy.app.handlers.load_post.remove(_opened)
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)

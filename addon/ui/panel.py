@@ -10,7 +10,9 @@ from bpy.props import EnumProperty
 from ...datagen.sequence import InputError
 from .. import settings
 from ..operators import add_cameras
-from ..runtime import jobs, worker_options
+from ..runtime import worker_options
+from ..runtime.folders import ADDON
+from . import job_rows
 
 PRESETS = {  # what they differ in
     "DRAFT": {"size": 64, "samples": 8, "method": "lift", "budget": "ALL", "refine": 0.0},
@@ -87,14 +89,14 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
             about = "at most" if chosen.budget == "NUMBER" else "about"
             col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
-        if not worker_options.named(context):
+        if not worker_options.has_worker_python(context):
             row = layout.row(align=True)
             row.label(text="No runtime yet", icon="ERROR")
-            row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = worker_options.ROOT
+            row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = ADDON
         row = layout.row()
         row.scale_y = 1.5
         _reconstruct(row, chosen)
-        jobs.draw(layout)
+        job_rows.draw_jobs(layout)
         layout.operator("timesplat.import_asset", icon="IMPORT")
 
 
@@ -149,9 +151,9 @@ class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
             layout.prop(chosen, chosen.budget.lower(), text=" ")
         layout.prop(chosen, "look")
         layout.prop(chosen, "output")
-        if mine := worker_options.get(context):
-            layout.prop(mine, "checkpoint")
-            layout.prop(mine, "device")
+        if preferences := worker_options.addon_preferences(context):
+            layout.prop(preferences, "checkpoint")
+            layout.prop(preferences, "device")
 
 
 class TIMESPLAT_MT_object(bpy.types.Menu):

@@ -64,7 +64,7 @@ told["truth"], told["asset"] = [[at(a, 48, 32), at(a, 4, 4)] for a in (truth, as
 told["gain"] = float(np.abs(difference - np.minimum(4 * np.abs(truth - asset), 1)).max())
 told["said"] = part("addon.runtime.jobs").JOBS[-1].message
 told["expected"] = float(-10 * np.log10(np.mean((truth - asset) ** 2)))
-told["left"] = os.listdir(part("addon.runtime.worker_options").user_folder("runs"))
+told["left"] = os.listdir(part("addon.runtime.folders").user_folder("runs"))
 def right():
     bpy.ops.timesplat.compare(size=96, samples=8)
     return at(thirds(bpy.data.images["Timesplat Compare"])[0], 83, 32)

@@ -288,15 +288,15 @@ def test_it_needs_what_the_package_says():
 
 ABLE = """
 able = bool(importlib.util.find_spec("ensurepip") or importlib.util.find_spec("pip"))
-preferences, jobs = part("addon.runtime.worker_options"), part("addon.runtime.jobs")
-setup = part("addon.operators.runtime_buttons")
+options, folders, jobs = (part(f"addon.runtime.{x}") for x in ("worker_options", "folders", "jobs"))
+buttons = part("addon.operators.runtime_buttons")
 def op(name, **options):
     try:
         return list(getattr(bpy.ops.timesplat, name)(**options))
     except RuntimeError as e:
         return str(e)
 def left():
-    return sorted(x.name for n in ("runs", "runtime") for x in preferences.user_folder(n, create=False).glob("*"))
+    return sorted(x.name for n in ("runs", "runtime") for x in folders.user_folder(n, create=False).glob("*"))
 process, asked = part("addon.runtime.child_process"), []
 report = ["ok lift: fine", "ok network: fine"]
 def worker(python, request, folder):
@@ -311,24 +311,24 @@ result = dict(offline=op("install_runtime"), refused=left())
 bpy.context.preferences.system.use_online_access = True
 result |= dict(online=bpy.app.online_access, able=able, installed=op("install_runtime"), left=left())
 if able:
-    told = preferences.runtime()
-    result |= dict(versions=told["versions"], bytes=told["bytes"], python=preferences.worker_python(),
-                   folder=str(preferences.runtime_folder()), message=jobs.JOBS[-1].message, text=text(),
+    told = options.installed_runtime()
+    result |= dict(versions=told["versions"], bytes=told["bytes"], python=options.worker_python(),
+                   folder=str(folders.runtime_folder()), message=jobs.JOBS[-1].message, text=text(),
                    asked=asked[:])
     done = [sys.argv[1], "-c", "print('{\"event\": \"done\"}')"]
-    stage, setup._stage = setup._stage, lambda request: lambda folder: process.Child(done, request, folder)
+    stage, buttons._stage = buttons._stage, lambda request: lambda folder: process.Child(done, request, folder)
     report[:] = ["ok lift: fine", "FAILED: network: no weights; copy them again."]
-    result |= dict(ill=op("install_runtime"), one=text(), stays=preferences.runtime() == told)
+    result |= dict(ill=op("install_runtime"), one=text(), stays=options.installed_runtime() == told)
     report.clear()
     result |= dict(dead=op("install_runtime"), still=left())
-    os.unlink(preferences.worker_python())
+    os.unlink(options.worker_python())
     try:
-        preferences.worker_python()
+        options.worker_python()
     except Exception as e:
         result["dangling"] = str(e)
-    setup._stage = stage
-    result |= dict(removed=op("uninstall_runtime"), after=left(), state=preferences.runtime())
-    result["other"] = preferences.worker_python()
+    buttons._stage = stage
+    result |= dict(removed=op("uninstall_runtime"), after=left(), state=options.installed_runtime())
+    result["other"] = options.worker_python()
 tell(**result)
 """
 
@@ -361,7 +361,7 @@ if not able:
     tell(able=False)
     raise SystemExit
 def alive():
-    here = str(preferences.user_folder("runs"))
+    here = str(folders.user_folder("runs"))
     return [p for p in os.listdir("/proc") if p.isdigit() and cwd(p).startswith(here)]
 def cwd(p):
     try:
@@ -370,7 +370,7 @@ def cwd(p):
         return ""
 seen = []
 for until in ("virtual", "importing"):
-    job = jobs.start("Install runtime", [setup._stage({"task": "install", "build": "cpu"})], setup._installed)
+    job = jobs.start("Install runtime", [buttons._stage({"task": "install", "build": "cpu"})], buttons._installed)
     while until not in job.text and job.state == "running":
         job.step(0.1)
     busy = op("install_runtime") if until == "importing" else ""
@@ -431,10 +431,10 @@ def test_self_test(installed, tmp_path):
 DRAW = """
 from unittest.mock import MagicMock
 versions = {"torch": "2", "numpy": "2"}
-preferences._installed = {"python": "bin/python", "build": "cpu", "versions": versions, "bytes": 5e8}
-setup._report[:] = ["ok lift: fine", "FAILED: network: " + "long " * 40]
-setup._job = MagicMock(spec=jobs.Job, state="running", fraction=0.5, text="half", label="Install", number=1)
-jobs.JOBS.append(setup._job)
+options._installed = {"python": "bin/python", "build": "cpu", "versions": versions, "bytes": 5e8}
+buttons.self_test_report[:] = ["ok lift: fine", "FAILED: network: " + "long " * 40]
+buttons.last_job = MagicMock(spec=jobs.Job, state="running", fraction=0.5, text="half", label="Install", number=1)
+jobs.JOBS.append(buttons.last_job)
 prefs = bpy.context.preferences.addons[name].preferences
 def draw():
     layout = MagicMock()
@@ -446,7 +446,7 @@ watching = True
 sys.addaudithook(lambda event, args: watching and event in ("open", "os.listdir", "os.scandir", "import") and
                  files.append([event, str(args)]))
 drawn = draw()
-setup._job.state, setup._job.message = "failed", "No room."
+buttons.last_job.state, buttons.last_job.message = "failed", "No room."
 drawn += draw()
 watching = False
 jobs.JOBS.clear()

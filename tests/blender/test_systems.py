@@ -5,8 +5,8 @@ SWEEP = """
 import subprocess
 from types import ModuleType, SimpleNamespace
 jobs, process = part("addon.runtime.jobs"), part("addon.runtime.child_process")
-preferences = part("addon.runtime.worker_options")
-runs = preferences.user_folder("runs")
+folders = part("addon.runtime.folders")
+runs = folders.user_folder("runs")
 here, dead, foreign = os.getpid(), 44444, 55555
 class Winapi(ModuleType):
     SYNCHRONIZE, WAIT_TIMEOUT, asked, closed = 0x00100000, 258, [], []
@@ -48,14 +48,14 @@ def test_what_other_blenders_still_need_is_not_swept(installed):
 
 
 FOLDER = """
-preferences = part("addon.runtime.worker_options")
-before = str(preferences.user_folder("runs"))
-preferences.WINDOWS = True
+folders = part("addon.runtime.folders")
+before = str(folders.user_folder("runs"))
+folders.WINDOWS = True
 os.environ["LOCALAPPDATA"] = sys.argv[1]
-made = str(preferences.user_folder("runs"))
-runtime, exists = str(preferences.runtime_folder()), os.path.isdir(made)
+made = str(folders.user_folder("runs"))
+runtime, exists = str(folders.runtime_folder()), os.path.isdir(made)
 del os.environ["LOCALAPPDATA"]
-tell(before=before, made=made, exists=exists, runtime=runtime, without=str(preferences.user_folder("runs")),
+tell(before=before, made=made, exists=exists, runtime=runtime, without=str(folders.user_folder("runs")),
      version="%d.%d" % bpy.app.version[:2])
 """
 LONGEST = 126  # characters: of a file's name in torch 2.15's wheel for Windows, below site-packages

@@ -104,7 +104,7 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         side = w.sidebar()
         w.find("preferences.addon_show", side["x"] + 0.75 * (side["w"] - 28), 100, 300)  # until there is a runtime
         w.preferences(sys.executable)
-        assert w.ask("ours('addon.runtime.worker_options').get().python") == sys.executable
+        assert w.ask("ours('addon.runtime.worker_options').addon_preferences().python") == sys.executable
 
         w.sidebar()
         w.press("preset='DRAFT'", across=0.15)
