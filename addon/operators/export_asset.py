@@ -84,7 +84,7 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
         if motion is not None:
             request["motion"] = str(Path(folder) / "motion.npy")
             np.save(request["motion"], motion)
-        return child_process.ask(python, request)["complaints"]
+        return child_process.ask_worker(python, request)["complaints"]
 
 
 @contextmanager

@@ -59,7 +59,7 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
         try:
-            child_process.ask(python, request)
+            child_process.ask_worker(python, request)
         except InputError as e:
             if not str(e).startswith("The process "):
                 raise  # it named the file

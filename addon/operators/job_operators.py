@@ -26,7 +26,7 @@ class TIMESPLAT_OT_cancel(_OfJob, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return any(job.state in ("running", "waiting") for job in jobs.JOBS)
+        return any(job.active for job in jobs.JOBS)
 
     def invoke(self, context, event):
         if event.type == "ESC":
@@ -59,7 +59,7 @@ class TIMESPLAT_OT_bring(_OfJob, bpy.types.Operator):
     def execute(self, context):
         job = self.chosen_job()
         if job and job.state == "waiting":
-            job.bring()
+            job.bring_in()
             self.report({"INFO"} if job.state == "done" else {"ERROR"}, job.message)
         return {"FINISHED"}
 

@@ -96,7 +96,7 @@ def start(chosen, context) -> jobs.Job:
     def reconstruct(folder: Path) -> child_process.Child:
         settings.learn(time.monotonic() - begun, pixels, shot["samples"])
         places = {"sequence": str(folder / "sequence"), "asset": str(folder / "asset.ply")}
-        return child_process.worker(python, asked | places, folder)
+        return child_process.start_worker(python, asked | places, folder)
 
     # The operator is gone by the time that a stage or the end comes: what they need is taken from it now.
     look = chosen.look

@@ -99,7 +99,7 @@ class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
 
     def start(self, context):
         python, request = worker_options.worker_python(context), _test(context)
-        return jobs.start("Self-test", [lambda folder: child_process.worker(python, request, folder)], _tested)
+        return jobs.start("Self-test", [lambda folder: child_process.start_worker(python, request, folder)], _tested)
 
 
 def _stage(request: dict):
@@ -122,7 +122,7 @@ def _test_installed(folder: Path) -> child_process.Child:
     """The stage after the installation: the self-test of what was installed."""
     worker_options.reload_installed_runtime()
     python = folders.runtime_folder() / worker_options.installed_runtime()["python"]
-    return child_process.worker(str(python), _test(bpy.context), folder)
+    return child_process.start_worker(str(python), _test(bpy.context), folder)
 
 
 def _installed(event: dict, folder: Path) -> str:

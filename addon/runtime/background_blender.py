@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A Blender beside Blender: a process without a window that opens a copy of the artist's file and does one thing.
+"""A Blender in the background: a process without a window that opens a copy of the artist's file and does one thing.
 
 So rendering never blocks the artist's Blender, nothing of the open scene can change, to cancel is to end a process, and
-a crash is a sentence. `start` belongs to the add-on; a module that runs beside ends with `serve(do)`, and speaks as
-`process` says.
+a crash is a sentence. `start` belongs to the artist's Blender; a module that runs in the background ends with
+`serve(do)`, and speaks as `child_process` says.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from bpy.app.handlers import persistent
 from ...datagen.sequence import InputError
 from . import child_process
 
-_at_opening: set[str] | None = None  # the file's texts that run when it is opened, as it was then; None: not known
+_texts_at_opening: set[str] | None = None  # of the file, those that ran when it was opened; None: not known
 
 
 def start(module: str, request: dict, folder: Path) -> child_process.Child:
@@ -33,7 +33,7 @@ def start(module: str, request: dict, folder: Path) -> child_process.Child:
     cannot be written, or would run a text that was not there when the file was opened: one that was appended, perhaps,
     and that Blender itself has not run."""
     scripts = not bpy.app.autoexec_fail  # whether those in the file may run: as here
-    if scripts and _at_opening is not None and (new := _run_when_opened() - _at_opening):
+    if scripts and _texts_at_opening is not None and (new := _registered_texts() - _texts_at_opening):
         raise InputError(
             f"{min(new)}: this text came after the file was opened, and its Register is on, so that it would run in "
             "the copy that is rendered; switch Register off, or, if you trust it, save and open the file again."
@@ -100,27 +100,30 @@ def serve(do: Callable[[dict, Callable], dict]) -> NoReturn:
 
 
 def _leave_when_closed(pipe: int) -> None:
+    """For a thread: ends the process when Blender is gone. (`model.worker` and `install` do so in their own words: they
+    run under a Python without Blender, `install` even without this package.)"""
     while os.read(pipe, 1 << 16):
         pass
     os._exit(3)
 
 
-def _run_when_opened() -> set[str]:
+def _registered_texts() -> set[str]:
+    """Names of the texts that Blender runs when it opens the file."""
     return {text.name for text in bpy.data.texts if text.use_module}
 
 
 @persistent
-def _opened(*_) -> None:
-    global _at_opening
-    _at_opening = _run_when_opened()
+def _remember_texts(*_) -> None:
+    global _texts_at_opening
+    _texts_at_opening = _registered_texts()
 
 
 def register() -> None:
-    bpy.app.timers.register(_opened)  # no file can be looked into while add-ons are registered
-    bpy.app.handlers.load_post.append(_opened)
+    bpy.app.timers.register(_remember_texts)  # no file can be looked into while add-ons are registered
+    bpy.app.handlers.load_post.append(_remember_texts)
 
 
 def unregister() -> None:
-    bpy.app.handlers.load_post.remove(_opened)
-    if bpy.app.timers.is_registered(_opened):
-        bpy.app.timers.unregister(_opened)
+    bpy.app.handlers.load_post.remove(_remember_texts)
+    if bpy.app.timers.is_registered(_remember_texts):
+        bpy.app.timers.unregister(_remember_texts)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Child processes that answer in JSON lines, read without ever waiting: the worker (`model.worker`) under a Python
-that has torch, and a Blender without a window that renders (`capture`).
+that has torch, and a Blender without a window that renders (`background_blender`).
 
 torch never comes into Blender's own process. A child gets one JSON object on its standard input and says
     {"event": "progress", "fraction": 0..1, "text": …}      as often as it likes
     {"event": "done", …} or {"event": "error", "message": one sentence}     once
 on its standard output; what it writes to standard error is its log. Threads read both, the caller asks `poll`.
-However much a child says, only its last progress, its end and a MOST_LOG of log are kept. The process and its
+However much a child says, only its last progress, its end and MOST_LOG_BYTES of log are kept. The process and its
 children die on `kill`, with the add-on, and with Blender itself (they leave when their standard input closes).
 """
 
@@ -37,10 +37,10 @@ spec.loader.exec_module(package)
 sys.argv[1:] = []
 runpy.run_module("timesplat.{module}", run_name="__main__", alter_sys=True)
 """
-MOST_LOG = 1 << 20  # bytes of log that are kept in the file; beyond that only the end is remembered
-PIECE = 1 << 16  # longest line that is looked at
-FLOOD = 1 << 20  # bytes between two naps of the reader, so that a child that floods waits, and not Blender
-NAP = 0.02
+MOST_LOG_BYTES = 1 << 20  # bytes of log that are kept in the file; beyond that only the end is remembered
+LONGEST_LINE = 1 << 16  # bytes of a line that are looked at in one piece
+BYTES_UNTIL_NAP = 1 << 20  # bytes between two naps of the reader, so that a child that floods waits, and not Blender
+NAP_SECONDS = 0.02
 # Of Windows: a process in a group of its own, and no console window for it or for what it starts.
 NEW_GROUP, NO_WINDOW = 0x00000200, 0x08000000
 _running: set[Child] = set()
@@ -51,16 +51,16 @@ def launch(module: str) -> str:
     return LAUNCH.format(init=str(PACKAGE / "__init__.py"), folder=str(PACKAGE), module=module)
 
 
-def worker(python: str, request: dict, folder: Path) -> Child:
+def start_worker(python: str, request: dict, folder: Path) -> Child:
     """`model.worker` under the interpreter `python`, started at once (the request: see there)."""
     return Child([python, "-X", "utf8", "-c", launch("model.worker")], request, folder)
 
 
-def ask(python: str, request: dict) -> dict:
+def ask_worker(python: str, request: dict) -> dict:
     """Runs a request to the worker to its end; for tasks of a few seconds. Returns the "done" event; raises
     InputError with what the worker said."""
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
-        child = worker(python, request, Path(folder))
+        child = start_worker(python, request, Path(folder))
         try:
             while True:
                 for event in child.poll(1.0):
@@ -82,7 +82,7 @@ class Child:
         self._news = threading.Condition()
         self._progress: dict | None = None
         self._end: dict | None = None
-        self._told = False
+        self._end_reported = False
         self._tail = b""
         env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH")}
         env |= {"PYTHONUNBUFFERED": "1", **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))}
@@ -104,8 +104,8 @@ class Child:
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        for line in _pieces(self.process.stdout):
-            event = _event(line)
+        for line in _lines(self.process.stdout):
+            event = _parse_event(line)
             with self._news:
                 if event and self._end is None:
                     if event["event"] == "progress":
@@ -117,7 +117,7 @@ class Child:
         self._end_group()
         self._logger.join(10.0)  # what has left the group may hold the pipe
         with self._news:
-            self._end = self._end or {"event": "error", "message": self._last_words()}
+            self._end = self._end or {"event": "error", "message": self._why_it_ended()}
             self._news.notify_all()
         _running.discard(self)
 
@@ -125,15 +125,15 @@ class Child:
         written = 0
         try:
             with open(self.log, "ab", buffering=0) as log:
-                for line in _pieces(self.process.stderr):
-                    self._tail = (self._tail + line)[-PIECE:]
-                    if written <= MOST_LOG:
+                for line in _lines(self.process.stderr):
+                    self._tail = (self._tail + line)[-LONGEST_LINE:]
+                    if written <= MOST_LOG_BYTES:
                         with contextlib.suppress(OSError):  # the disk may be full; the tail is in memory
                             log.write(line)
                         written += len(line)
         except OSError:
-            for line in _pieces(self.process.stderr):
-                self._tail = (self._tail + line)[-PIECE:]
+            for line in _lines(self.process.stderr):
+                self._tail = (self._tail + line)[-LONGEST_LINE:]
 
     def poll(self, timeout: float | None = None) -> list[dict]:
         """What is new since the last call: the last progress, and the end ("done" or "error") once; waits up to
@@ -141,11 +141,11 @@ class Child:
         line of its log."""
         with self._news:
             if timeout:
-                self._news.wait_for(lambda: self._progress or (self._end and not self._told), timeout)
+                self._news.wait_for(lambda: self._progress or (self._end and not self._end_reported), timeout)
             news = [self._progress] if self._progress else []
-            if self._end and not self._told:
+            if self._end and not self._end_reported:
                 news.append(self._end)
-                self._told = True
+                self._end_reported = True
             self._progress = None
         return news
 
@@ -159,7 +159,7 @@ class Child:
         whole = head if head.endswith(tail) else head + b"\n[...]\n" + tail
         return whole.decode("utf-8", "replace")
 
-    def _last_words(self) -> str:
+    def _why_it_ended(self) -> str:
         code = self.process.returncode
         said = [x.strip() for x in self._tail.decode("utf-8", "replace").splitlines() if x.strip()]
         name = hex(code) if code >= 0xC0000000 else code  # as Windows' own are known
@@ -186,18 +186,18 @@ class Child:
             self.process.kill()
 
 
-def _pieces(pipe):
-    """Lines of a pipe, cut where they are longer than PIECE; with naps where they come too fast."""
+def _lines(pipe):
+    """Lines of a pipe, cut where they are longer than LONGEST_LINE; with naps where they come too fast."""
     count = 0
-    while line := pipe.readline(PIECE):
+    while line := pipe.readline(LONGEST_LINE):
         yield line
         count += len(line)
-        if count > FLOOD:
+        if count > BYTES_UNTIL_NAP:
             count = 0
-            time.sleep(NAP)
+            time.sleep(NAP_SECONDS)
 
 
-def _event(line: bytes) -> dict | None:
+def _parse_event(line: bytes) -> dict | None:
     """An event as the protocol has it, its fraction within 0..1 and its texts short; None for anything else."""
     if not line.startswith(b"{"):
         return None

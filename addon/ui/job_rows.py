@@ -18,12 +18,12 @@ def draw_jobs(layout) -> None:
         if job.state == "running":
             row.progress(factor=job.fraction, text=job.text)
         else:
-            said = job.message if job.state == "done" else f"{job.label}: {job.message or job.text}"
-            row.label(text=said, icon=STATE_ICONS[job.state])
+            text = job.message if job.state == "done" else f"{job.label}: {job.message or job.text}"
+            row.label(text=text, icon=STATE_ICONS[job.state])
         if job.state == "waiting":
             row.operator("timesplat.bring", text="", icon="IMPORT").number = job.number
         row.operator("timesplat.log", text="", icon="TEXT").number = job.number
-        if job.state in ("running", "waiting"):
+        if job.active:
             row.operator("timesplat.cancel", text="", icon="X").number = job.number
         elif job.state == "failed" and len(job.message) > 40:
             for line in textwrap.wrap(job.message, 44):

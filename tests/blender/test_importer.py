@@ -120,12 +120,12 @@ for key in ["worker", "direct"] if find("pxr") else ["worker"]:
     result[key + "_bad"] = load(filepath=sys.argv[2])
     result[key + "_none"] = load(filepath=sys.argv[2] + "c.usdc")
 os.environ["TIMESPLAT_PYTHON"] = named
-worker = importer.child_process.ask
+worker = importer.child_process.ask_worker
 def crash(python, request):
     raise part("datagen.sequence").InputError("The process was ended by signal 11: it said nothing")
-importer.child_process.ask = crash
+importer.child_process.ask_worker = crash
 result["crash"] = load(filepath=sys.argv[1])
-importer.child_process.ask = worker
+importer.child_process.ask_worker = worker
 os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
 importlib.util.find_spec = hidden
 result["python"] = load(filepath=sys.argv[1])

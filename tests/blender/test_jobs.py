@@ -44,7 +44,7 @@ def start():
     return reconstruct.start(chosen, bpy.context)
 def go(job, until=lambda job: False):
     while job.state == "running" and not until(job):
-        job.step(0.05)
+        job.advance(0.05)
 def state():
     for _ in range(600):  # what was killed may take its time to die
         if not family():
@@ -76,7 +76,7 @@ for i in range(10):
     time.sleep(random.random() / 2)  # its processes go on meanwhile
     texts.append([len(job._stages), job.text])
     job.cancel()
-    ended.append([job.state, job.message, job.step()])
+    ended.append([job.state, job.message, job.advance()])
 tell(texts=texts, ended=ended, kept=len(jobs.JOBS), state=state(), first=first, session=session)
 """
     )
@@ -144,7 +144,7 @@ def test_a_worker_that_floods(installed):
     told = installed(
         HEAD
         + f"""
-process.worker = lambda python, request, folder: process.Child([python, "-c", {FLOODS!r}], request, folder)
+process.start_worker = lambda python, request, folder: process.Child([python, "-c", {FLOODS!r}], request, folder)
 job = start()
 go(job)
 tell(ended=[job.state, job.message], log=len(job.log_text()), state=state(), first=first, session=session)
@@ -165,7 +165,7 @@ def test_a_full_disk(installed, tmp_path, room):
         told = installed(
             HEAD
             + """
-jobs.user_folder = lambda kind: runs
+part("addon.runtime.run_folders").user_folder = jobs.user_folder = lambda kind: runs
 runs = Path(sys.argv[1])
 chosen.size = 512
 try:
@@ -219,7 +219,7 @@ before = job.state, len(names())
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1], copy=True)
 bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
 kept = job in jobs.JOBS and job.state
-quiet = jobs._quiet(job)
+quiet = jobs._may_come_in(job)
 done = bpy.ops.timesplat.bring(number=job.number) if kept == "waiting" else []
 tell(before=before, kept=kept, quiet=quiet, done=list(done), message=job.message,
      clouds=sum("timesplat" in o for o in bpy.data.objects), left=os.listdir(runs), processes=family())
@@ -244,7 +244,7 @@ first_job = jobs.start("first", [stage])
 for i in range(20):
     jobs.start(str(i), [stage]).cancel()
 labels = [j.label for j in jobs.JOBS]
-jobs.close()
+jobs.cancel_all()
 tell(labels=labels, state=state(), first=first, session=session)
 """
     )
@@ -286,9 +286,9 @@ said = []
 for stages, finish in (([stage, broken], None), ([stage], broken)):
     job = jobs.start("x", stages, finish)
     while job.state == "running":
-        jobs._look()
+        jobs._poll_jobs()
         time.sleep(0.05)
-    jobs._look()
+    jobs._poll_jobs()
     said.append([job.state, job.message, "lamp" in job.log_text()])
 tell(said=said, state=state(), first=first, session=session)
 """

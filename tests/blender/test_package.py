@@ -101,7 +101,7 @@ folder = os.path.dirname(sys.modules[name].__file__)
 result["strange"] = [[m, f] for m, f in ((m, getattr(x, "__file__", None) or "") for m, x in list(sys.modules.items()))
     if (f.startswith(folder) and m != name and not m.startswith(name + ".")) or m.split(".")[0] == "timesplat"]
 result["heavy"] = sorted({m.split(".")[0] for m in sys.modules} & {"torch", "numba", "PIL", "triton", "safetensors"})
-timers = [part("addon.runtime.jobs")._look]
+timers = [part("addon.runtime.jobs")._poll_jobs]
 on, off = [], []
 for _ in range(2):
     on.append(traces())
@@ -110,7 +110,7 @@ for _ in range(2):
     result["timers"] = any(bpy.app.timers.is_registered(t) for t in timers)
     bpy.ops.preferences.addon_enable(module=name)
     use()
-    timers.append(part("addon.runtime.jobs")._look)
+    timers.append(part("addon.runtime.jobs")._poll_jobs)
 tell(**result, on=on, off=off, runs=os.listdir(bpy.utils.extension_path_user(name, path="runs", create=True)))
 """
 

@@ -106,7 +106,7 @@ camera.select_set(False)
 ball.hide_render = True
 refused("hidden")
 ball.hide_render = False
-part("addon.runtime.background_blender")._opened()  # as after a file was opened
+part("addon.runtime.background_blender")._remember_texts()  # as after a file was opened
 text = bpy.data.texts.new("guest")
 text.use_module = True
 refused("guest")

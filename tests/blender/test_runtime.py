@@ -35,7 +35,7 @@ runtime = load()
 
 def wheel(folder: Path, name: str, version: str, code: str = "", needs=()) -> None:
     """A package of one module, as pip installs it."""
-    module = {n: m for n, _, m in runtime.NEEDS}.get(name, name.replace("-", "_"))
+    module = {n: m for n, _, m in runtime.REQUIREMENTS}.get(name, name.replace("-", "_"))
     info = f"{name.replace('-', '_')}-{version}.dist-info"
     meta = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
     files = {
@@ -53,7 +53,7 @@ def index(tmp_path):
     """A folder of all packages that the runtime needs, each newer than it must be."""
     folder = tmp_path / "wheels"
     folder.mkdir()
-    for name, version, _ in runtime.NEEDS:
+    for name, version, _ in runtime.REQUIREMENTS:
         wheel(folder, name, f"{version}.7")
     return folder
 
@@ -103,7 +103,7 @@ def test_installs_again_and_removes(tmp_path, index):
     assert first.code == 0, first.log
     told = first.end
     assert told["event"] == "done" and told["build"] == "cpu" and not (tmp_path / "target").exists()
-    assert told["versions"] == {name: f"{version}.7" for name, version, _ in runtime.NEEDS}
+    assert told["versions"] == {name: f"{version}.7" for name, version, _ in runtime.REQUIREMENTS}
     steps = [e["fraction"] for e in first.events[:-1]]
     assert steps == sorted(steps) and steps[0] == 0 and steps[-1] < 1 and all(e["text"] for e in first.events[:-1])
     texts = " ".join(e["text"] for e in first.events[:-1])
@@ -171,7 +171,7 @@ def test_counts_while_pip_makes_and_removes_its_folders(tmp_path):
     thread.start()
     try:
         while rounds < 500 and thread.is_alive():
-            found.add(runtime._fetched(tmp_path))
+            found.add(runtime._bytes_fetched(tmp_path))
     finally:
         finished.set()
         thread.join()
@@ -190,9 +190,9 @@ def test_torch_comes_from_the_builds_index_unless_pip_has_one(tmp_path, monkeypa
     asked = []
     monkeypatch.setattr(runtime, "_make_venv", lambda folder: ["pip"])
     monkeypatch.setattr(
-        runtime, "_install", lambda command, *rest: asked.append(command[command.index("--no-input") :])
+        runtime, "_pip_install", lambda command, *rest: asked.append(command[command.index("--no-input") :])
     )
-    monkeypatch.setattr(runtime, "_prove", lambda python: {})
+    monkeypatch.setattr(runtime, "_import_all", lambda python: {})
     for has, build in ((False, "cpu"), (False, "cuda"), (True, "cpu")):
         monkeypatch.setattr(runtime, "_has_index", lambda pip, has=has: has)
         (tmp_path / "w" / "venv").mkdir(parents=True)
@@ -231,14 +231,14 @@ def test_whether_pip_has_an_index(monkeypatch):
     ],
 )
 def test_what_pip_says_becomes_one_sentence(line, words):
-    why = runtime._why(line.split("\n"), Path("somewhere"))
+    why = runtime._explain(line.split("\n"), Path("somewhere"))
     assert words in why and "\n" not in why and why.endswith(".")
 
 
 def test_a_python_without_ensurepip(tmp_path, monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n in ("ensurepip", "pip") else real(n))
-    with pytest.raises(runtime.Stop, match=r"python3-venv.*preferences\.$"):
+    with pytest.raises(runtime.InstallError, match=r"python3-venv.*preferences\.$"):
         runtime._make_venv(tmp_path / "v")
     assert not (tmp_path / "v").exists()
     monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "ensurepip" else real(n))
@@ -281,7 +281,7 @@ def test_it_needs_what_the_package_says():
     extras = project["optional-dependencies"]
     named = project["dependencies"] + extras["torch"] + extras["usd"]
     said = {re.split("[><=]", x)[0]: re.search(r">=([\d.]+)", x)[1] for x in named}
-    assert said == {name: version for name, version, _ in runtime.NEEDS}
+    assert said == {name: version for name, version, _ in runtime.REQUIREMENTS}
 
 
 # ---------------------------------------------------------------- in Blender
@@ -303,7 +303,7 @@ def worker(python, request, folder):
     asked.append([python, request])
     code = f"print({json.dumps({'event': 'done', 'report': report})!r})" if report else "raise SystemExit('no AVX')"
     return process.Child([sys.argv[1], "-c", code], request, folder)
-process.worker = worker
+process.start_worker = worker
 text = lambda: bpy.data.texts["Timesplat self-test"].as_string().splitlines()
 """
 WHOLE = r"""
@@ -372,7 +372,7 @@ seen = []
 for until in ("virtual", "importing"):
     job = jobs.start("Install runtime", [buttons._stage({"task": "install", "build": "cpu"})], buttons._installed)
     while until not in job.text and job.state == "running":
-        job.step(0.1)
+        job.advance(0.1)
     busy = op("install_runtime") if until == "importing" else ""
     before = len(alive())
     job.cancel()

@@ -22,7 +22,7 @@ class Winapi(ModuleType):
     def CloseHandle(self, handle):
         self.closed.append(handle)
 winapi = sys.modules["_winapi"] = Winapi("_winapi")
-jobs.WINDOWS = True
+part("addon.runtime.run_folders").WINDOWS = True
 def ended(*_):
     raise SystemExit("os.kill ends a process there")
 os.kill = ended
