@@ -21,7 +21,7 @@ from ..datagen.sequence import InputError
 from . import settings
 from .operators import reconstruct
 from .runtime import jobs
-from .runtime.capture import shoot
+from .runtime.capture import start_capture
 
 SKIPPED = ("look",)  # of no use without a window
 
@@ -88,12 +88,10 @@ def _option(parser, chosen, key: str) -> None:
 def _render(chosen, args) -> None:
     rig = {"rig": args.rig, "targets": args.targets, "seed": args.seed, "passes": args.passes}
     request = reconstruct.request(chosen, bpy.context) | rig | {"sequence": str(args.out.resolve())}
-    _run(
-        jobs.start(
-            "Rendering", [lambda folder: shoot(request, folder)], lambda event, folder: f"{event['pictures']} pictures"
-        )
-    )
-    print(f"{args.out}: {jobs.JOBS[-1].message}")
+    stages = [lambda folder: start_capture(request, folder)]
+    job = jobs.start("Rendering", stages, lambda event, folder: f"{event['pictures']} pictures")
+    _run(job)
+    print(f"{args.out}: {job.message}")
 
 
 def _reconstruct(chosen, args) -> None:

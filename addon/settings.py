@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 
 from ..datagen.scene import shown_objects
 from ..datagen.sequence import InputError
-from .asset import display
+from .asset.sliders import LOOKS
 
 RIG = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
 AIM = 24  # frames that "every: automatic" comes near to
@@ -80,7 +80,7 @@ class Settings:
         name="Share", description="Of the Gaussians predicted", default=10, min=0.1, max=100, subtype="PERCENTAGE"
     )
     number: IntProperty(name="Number", description="Most Gaussians", default=4000, min=1, max=10_000_000)
-    look: EnumProperty(name="Look", items=[(x, x, "") for x in display.LOOKS], default=display.LOOKS[0])
+    look: EnumProperty(name="Look", items=[(x, x, "") for x in LOOKS], default=LOOKS[0])
     output: StringProperty(name="Save As", description="Also keep the asset as this .ply", subtype="FILE_PATH")
 
 

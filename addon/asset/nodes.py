@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The node group that plays an asset, its sliders, and the materials of its looks.
+"""The node group that plays an asset, and the materials of its looks; its inputs are the sliders (sliders.py).
 
 All of it is saved in the .blend: it plays without this add-on, at fractional frames too. At scene frame f
 
@@ -21,73 +21,11 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ...model.asset import SH_C0, VISIBLE
+from ...model.asset import SH_C0
+from .sliders import NATIVE, REPEATS, SLIDERS
 
 GROUP = "Timesplat 2"  # the number counts versions of the node group, so that old files keep theirs
-# Blender 5.3 draws point clouds of a type of their own as splats. It takes the attributes scale (σ), rotation and
-# radiance:base (the constant spherical harmonic of sRGB colour, opacity), as its importers of .ply and USD write
-# them (Blender's source: io/ply/importer/ply_import_gsplat.cc, nodes/geometry/nodes/node_geo_points_type.cc).
-NATIVE = bpy.app.version >= (5, 3) and hasattr(bpy.types, "GeometryNodePointsSetType")
 NATIVE_NAMES = ("3D Gaussian Splats", "GAUSSIAN_SPLAT")  # of the type: what the menu shows, its identifier
-LOOKS = ("Automatic", "Points", "Splats", *(["Native"] if NATIVE else []))
-REPEATS = ("Hold", "Loop", "Ping-Pong")
-MENUS = {"Look": LOOKS, "Repeat": REPEATS}
-SLIDERS = {  # name: (panel in the modifier, kind of socket, default, lowest, highest, description)
-    "Look": ("", "Menu", "Automatic", None, None, "Automatic is Points in the viewport and Splats in renders"),
-    "Opacity Cut": ("", "Float", VISIBLE, 0, 1, "Gaussians fainter than this at a moment are left out"),
-    "Point Size": ("", "Float", 1.5, 0, 100, "Radius of the dots of the look Points, in standard deviations"),
-    "Density": ("", "Float", 1.0, 0, 1, "Share of the Gaussians that is shown"),
-    "Frame Start": ("Time", "Float", 0.0, -1e6, 1e6, "Scene frame at which the clip starts"),
-    "Frame End": ("Time", "Float", 23.0, -1e6, 1e6, "Scene frame at which the clip ends"),
-    "Time Offset": ("Time", "Float", 0.0, -1e6, 1e6, "The clip starts this many frames later"),
-    "Time Scale": ("Time", "Float", 1.0, -100, 100, "Speed: 2 is twice as fast, negative is backwards"),
-    "Repeat": ("Time", "Menu", "Hold", None, None, "What happens beyond the ends of the clip"),
-    "Lifetime Scale": ("Time", "Float", 1.0, 0.01, 100, "How long each Gaussian is visible, times this"),
-    "Crop": ("Crop", "Bool", False, None, None, "Leave out what lies outside the box"),
-    "Crop Min": ("Crop", "Vector", (-1.0,) * 3, -1e6, 1e6, "Lower corner of the box, in units of the clip"),
-    "Crop Max": ("Crop", "Vector", (1.0,) * 3, -1e6, 1e6, "Upper corner of the box, in units of the clip"),
-}
-
-
-# ---------------------------------------------------------------- the sliders of a modifier
-
-
-def rna(modifier, name: str) -> tuple:
-    """(owner, property) of an input for `layout.prop` and `keyframe_insert`, None where the modifier's node
-    group is an older one that lacks it. Blender 5.2 moved inputs into RNA."""
-    for item in modifier.node_group.interface.items_tree:
-        if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.name == name:
-            if hasattr(modifier, "properties"):
-                return getattr(modifier.properties.inputs, item.identifier), "value"
-            return modifier, f'["{item.identifier}"]'
-    return None
-
-
-def set_input(modifier, name: str, value) -> None:
-    """Sets an input of the modifier by the name it shows. A menu takes an item's name or its index."""
-    owner, key = rna(modifier, name)
-    if name in MENUS:
-        items = MENUS[name]
-        index = items.index(value) if isinstance(value, str) else value
-        value = index if owner == modifier else items[index]
-    if key == "value":
-        owner.value = value
-    else:
-        owner[key[2:-2]] = value
-    modifier.id_data.update_tag()
-
-
-def get_input(modifier, name: str):
-    """The input's value: a number, a bool, a tuple of three, or the name of a menu's item; the default where an
-    older node group lacks the input."""
-    found = rna(modifier, name)
-    if found is None:
-        return SLIDERS[name][2]
-    owner, key = found
-    value = owner.value if key == "value" else owner[key[2:-2]]
-    if name in MENUS:
-        return value if isinstance(value, str) else MENUS[name][value]
-    return tuple(value) if SLIDERS[name][1] == "Vector" else value
 
 
 # ---------------------------------------------------------------- writing node trees
@@ -153,43 +91,47 @@ class Nodes:
 # ---------------------------------------------------------------- the group
 
 
-def group(clouds: bool):
+def node_group(clouds: bool):
     """The shared node group: made once a file. clouds: for point clouds, else for meshes of vertices."""
     name = GROUP + ("" if clouds else " Mesh") + (" Native" if NATIVE else "")
     if tree := bpy.data.node_groups.get(name):
         return tree
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.is_modifier = True
-    menus = _interface(tree.interface)
+    menus = _make_interface(tree.interface)
     n = Nodes(tree)
     given = n.add("NodeGroupInput").outputs
     geometry = given["Geometry"] if clouds else n.out("GeometryNodeMeshToPoints", given["Geometry"])
-    n.put(n.add("NodeGroupOutput").inputs[0], _looks(n, given, _moment(n, given, geometry)))
+    n.put(n.add("NodeGroupOutput").inputs[0], _choose_look(n, given, _show_moment(n, given, geometry)))
     for name, socket in menus.items():  # a menu has items only once it is connected
-        socket.default_value = SLIDERS[name][2]
+        socket.default_value = SLIDERS[name].default
     return tree
 
 
-def _interface(interface) -> dict:
+def _make_interface(interface) -> dict:
     """Makes the inputs and the output; returns the menus by name."""
     interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     panels = {"": None} | {name: interface.new_panel(name) for name in ("Time", "Crop")}
     menus = {}
-    for name, (panel, kind, default, low, high, description) in SLIDERS.items():
+    for name, slider in SLIDERS.items():
         socket = interface.new_socket(
-            name, in_out="INPUT", socket_type=f"NodeSocket{kind}", description=description, parent=panels[panel]
+            name,
+            in_out="INPUT",
+            socket_type=f"NodeSocket{slider.socket}",
+            description=slider.description,
+            parent=panels[slider.panel],
         )
-        if kind == "Menu":
+        if slider.socket == "Menu":
             menus[name] = socket
             continue
-        socket.default_value = default
-        if low is not None:
-            socket.min_value, socket.max_value = low, high
+        socket.default_value = slider.default
+        if slider.lowest is not None:
+            socket.min_value, socket.max_value = slider.lowest, slider.highest
     return menus
 
 
-def _moment(n: Nodes, given, g):
+def _show_moment(n: Nodes, given, g):
     """The Gaussians that are shown at the scene's frame, where they are, with their alpha."""
     frame = n.add("GeometryNodeInputSceneTime").outputs["Frame"]
     start = given["Frame Start"]
@@ -224,7 +166,8 @@ def _moment(n: Nodes, given, g):
     return n.out("GeometryNodeSetPosition", g, None, None, step.outputs["Vector"])
 
 
-def _looks(n: Nodes, given, g):
+def _choose_look(n: Nodes, given, g):
+    """The Gaussians as the slider Look has them."""
     size = n.math("MULTIPLY", n.named("gs_radius"), given["Point Size"])
     points = n.out("GeometryNodeSetPointRadius", g, None, size)
     points = n.out("GeometryNodeSetMaterial", points, None, points_material())
@@ -234,11 +177,11 @@ def _looks(n: Nodes, given, g):
     automatic = n.out("GeometryNodeSwitch", viewport, splats, points, input_type="GEOMETRY")
     options = {"Automatic": automatic, "Points": points, "Splats": splats}
     if NATIVE:
-        options["Native"] = native(n, g)
+        options["Native"] = native_splats(n, g)
     return n.menu(given["Look"], options, "GEOMETRY")
 
 
-def native(n: Nodes, g):
+def native_splats(n: Nodes, g):
     """Splats of Blender's own kind: the opacity of radiance:base follows the moment. No material: Blender's own
     for splats is used. The type is set where Blender has it."""
     base = n.add("FunctionNodeSeparateColor", n.named("radiance:base", "FLOAT_COLOR")).outputs
@@ -258,7 +201,7 @@ def native(n: Nodes, g):
 
 
 def native_attributes(asset) -> list[tuple]:
-    """What `native` needs in the data, beside the rest: (name, type, key, values) each."""
+    """What `native_splats` needs in the data, beside the rest: (name, type, key, values) each."""
     base = (asset.rgb - 0.5) / SH_C0
     alpha = asset.opacity[:, None]
     return [

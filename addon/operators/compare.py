@@ -2,31 +2,24 @@
 """Original and reconstruction: which of them the scene shows (`timesplat.show`), and both with their difference side by
 side at the present frame (`timesplat.compare`).
 
-For the latter both are rendered by Cycles, small, in a Blender of their own (`beside`), as the capture rendered what
-the asset was made from: with Even Light where that was on, over white, colours as they are. The picture is the image
-"Timesplat Compare".
+For the latter both are rendered in the background (`render_comparison`). The picture is the image "Timesplat Compare".
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, IntProperty
-from mathutils import Matrix
 
-from ...datagen import capture
-from ...datagen.scene import borrowed, shown_objects
+from ...datagen.scene import shown_objects
 from ...datagen.sequence import InputError
-from ..asset import display
-from ..runtime import background_blender, jobs
-from . import edit
+from ..runtime import background_blender, child_process, jobs
+from ..runtime.render_comparison import GAIN
+from .common import OnAsset, errors_reported
 
 IMAGE = "Timesplat Compare"
-SPLAT_SAMPLES = 2  # splats are smooth and glow by themselves: more samples change next to nothing
-GAIN = 4  # the difference is shown this many times as strong
 
 
 def originals_of(ob, context) -> list:
@@ -54,21 +47,22 @@ def start(ob, context, size: int, samples: int) -> jobs.Job:
         "originals": [o.name for o in originals_of(ob, context)],
         "lights": [o.name for o in shown_objects(scene, context.view_layer) if o.type == "LIGHT"],
         "even": bool(ob.get("timesplat_lighting", True)),
-        "view": None if scene.camera and scene.camera.type == "CAMERA" else _view(context),
+        "view": None if scene.camera and scene.camera.type == "CAMERA" else _viewport_camera(context),
         "size": size,
         "samples": samples,
     }
 
     def finish(event: dict, folder: Path) -> str:
-        show(to_image(np.load(folder / "compared.npy")), bpy.context)
+        show_image(to_image(np.load(folder / "compared.npy")), bpy.context)
         return f"Original, reconstruction, {GAIN} times the difference: {event['psnr']:.1f} dB PSNR."
 
-    return jobs.start(
-        "Compare", [lambda folder: background_blender.start("addon.operators.compare", request, folder)], finish
-    )
+    def render(folder: Path) -> child_process.Child:
+        return background_blender.start("addon.runtime.render_comparison", request, folder)
+
+    return jobs.start("Compare", [render], finish)
 
 
-def _view(context) -> dict:
+def _viewport_camera(context) -> dict:
     """The 3D view as a camera: settings of its data, matrix in the world, width and height."""
     for area in context.screen.areas if context.screen and not bpy.app.background else ():
         if area.type != "VIEW_3D":
@@ -81,68 +75,6 @@ def _view(context) -> dict:
         matrix = [list(row) for row in space.region_3d.view_matrix.inverted()]
         return {"data": data, "matrix": matrix, "width": region.width, "height": region.height}
     raise InputError(f"{context.scene.name}: there is no camera and no 3D view to look through; add a camera.")
-
-
-# ---------------------------------------------------------------- in the Blender beside
-
-
-def compare(request: dict, progress) -> dict:
-    """Writes compared.npy, (height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made
-    from, the asset, GAIN times their absolute difference; returns the PSNR in dB over the whole picture."""
-    scene = bpy.context.scene
-    named = {key: [scene.objects[n] for n in request[key]] for key in ("originals", "lights")}
-    view = _camera(scene, request["view"])
-    progress(0.1, "rendering the original")
-    truth = _picture(scene, [*named["originals"], *named["lights"]], view, request, request["samples"])
-    progress(0.6, "rendering the reconstruction")
-    asset = _picture(scene, [scene.objects[request["asset"]]], view, request, SPLAT_SAMPLES)
-    np.save("compared.npy", np.concatenate([truth, asset, np.minimum(GAIN * np.abs(truth - asset), 1)], 1))
-    error = float(((truth - asset) ** 2).mean())
-    return {"psnr": min(-10 * math.log10(max(error, 1e-12)), 120.0)}
-
-
-def _camera(scene, view: dict | None) -> tuple:
-    """(camera, its matrix in the world, width, height in any unit)."""
-    if not view:
-        render = scene.render
-        data, matrix = scene.camera.data, scene.camera.matrix_world.copy()
-        return data, matrix, render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
-    data = bpy.data.cameras.new("timesplat")
-    for key, value in view["data"].items():
-        setattr(data, key, value)
-    return data, Matrix(view["matrix"]), view["width"], view["height"]
-
-
-def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> np.ndarray:
-    """(H,W,3) float32, sRGB-encoded, over white: the objects, shown whether or not they are hidden."""
-    data, matrix, width, height = view
-    scale = request["size"] / max(width, height)
-    width, height = max(1, round(width * scale)), max(1, round(height * scale))
-    for ob in objects:
-        ob.hide_render = False
-        if modifier := display.sampler(ob):
-            display.set_input(modifier, "Look", "Splats")
-    with borrowed(objects, lights=not request["even"]) as stage, capture.temporary() as made:
-        capture.render_settings(stage, width, height, samples, False, "CYCLES", "CPU", 0)
-        if request["even"]:
-            capture.even_light(stage, made)
-        stage.render.use_multiview = False
-        stage.cycles.transparent_max_bounces = display.TRANSPARENT_BOUNCES
-        stage.cycles.min_transparent_bounces = display.TRANSPARENT_BOUNCES  # no roulette: less noise
-        camera = bpy.data.objects.new("timesplat", data)
-        made.append(camera)
-        camera.matrix_world = matrix
-        stage.collection.objects.link(camera)
-        stage.camera = camera
-        stage.frame_set(scene.frame_current, subframe=scene.frame_subframe)
-        stage.render.filepath = str(Path.cwd() / "frame")
-        with bpy.context.temp_override(scene=stage):
-            bpy.ops.render.render(write_still=True)
-    rgba = capture.straight_srgb(capture.read_multilayer(Path("frame.exr"))["combined"]) / np.float32(255)
-    return rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
-
-
-# ---------------------------------------------------------------- in the artist's Blender
 
 
 def to_image(pixels: np.ndarray):
@@ -160,7 +92,7 @@ def to_image(pixels: np.ndarray):
     return image
 
 
-def show(image, context) -> None:
+def show_image(image, context) -> None:
     """Shows the image in an image editor: one that is open, else in a window of its own."""
     if bpy.app.background or not context.window:
         return
@@ -174,7 +106,7 @@ def show(image, context) -> None:
     areas[0].tag_redraw()
 
 
-class TIMESPLAT_OT_show(bpy.types.Operator):
+class TIMESPLAT_OT_show(OnAsset, bpy.types.Operator):
     """Show the original, the reconstruction or both, in 3D views and in renders"""
 
     bl_idname = "timesplat.show"
@@ -191,13 +123,11 @@ class TIMESPLAT_OT_show(bpy.types.Operator):
         default="RESULT",
     )
 
-    poll = edit.TIMESPLAT_OT_delete.poll
-
     def execute(self, context):
-        try:
+        originals: list = []
+        with errors_reported(self):
             originals = originals_of(context.object, context)
-        except InputError as e:
-            self.report({"ERROR"}, str(e))
+        if not originals:
             return {"CANCELLED"}
         hidden = dict.fromkeys(originals, self.what == "RESULT") | {context.object: self.what == "ORIGINAL"}
         for ob, hide in hidden.items():
@@ -208,7 +138,7 @@ class TIMESPLAT_OT_show(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class TIMESPLAT_OT_compare(bpy.types.Operator):
+class TIMESPLAT_OT_compare(OnAsset, bpy.types.Operator):
     """Render the original, the reconstruction and their difference at this frame, side by side"""
 
     bl_idname = "timesplat.compare"
@@ -217,39 +147,19 @@ class TIMESPLAT_OT_compare(bpy.types.Operator):
     size: IntProperty(name="Size", description="Pixels of the longer side of each picture", default=384, min=16)
     samples: IntProperty(name="Samples", description="Cycles samples a pixel of the original", default=16, min=1)
 
-    poll = edit.TIMESPLAT_OT_delete.poll
-
     def invoke(self, context, event):
-        try:
+        with errors_reported(self):
             start(context.object, context, self.size, self.samples)
-        except InputError as e:
-            self.report({"ERROR"}, str(e))
-            return {"CANCELLED"}
-        return {"FINISHED"}
+            return {"FINISHED"}
+        return {"CANCELLED"}
 
     def execute(self, context):
-        try:
+        with errors_reported(self):
             job = start(context.object, context, self.size, self.samples)
             jobs.wait(job)
-        except InputError as e:
-            self.report({"ERROR"}, str(e))
-            return {"CANCELLED"}
-        self.report({"INFO"}, job.message)
-        return {"FINISHED"}
+            self.report({"INFO"}, job.message)
+            return {"FINISHED"}
+        return {"CANCELLED"}
 
 
-CLASSES = (TIMESPLAT_OT_show, TIMESPLAT_OT_compare)
-
-
-def register() -> None:
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
-
-
-if __name__ == "__main__":
-    background_blender.serve(compare)
+register, unregister = bpy.utils.register_classes_factory((TIMESPLAT_OT_show, TIMESPLAT_OT_compare))

@@ -12,7 +12,7 @@ by the worker, or where there is none with the pxr of Blender's own Python.
 from __future__ import annotations
 
 import tempfile
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import bpy
@@ -21,14 +21,20 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ...datagen.sequence import InputError
 from ...model import slices, usd
-from ...model.asset import Asset, atomic, write_ply
-from ..asset import asset_object, display
+from ...model.asset import Asset, write_ply
+from ..asset.apply_sliders import moment, with_sliders
+from ..asset.asset_object import asset_of, slider_values
+from ..asset.sliders import is_asset
+from ..asset.timeline import may_change, visit_frames
 from ..runtime import child_process, worker_options
-from .import_asset import busy
+from .common import wait_cursor
+from .original_usd import original_usd
 
 REPORT = "Timesplat USD report"
-SUFFIX = {"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz", "SLICE": ".ply", "SPLAT": ".splat"}
-SUFFIX |= {"SLICES": ""}
+SUFFIXES = {
+    **{"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz"},
+    **{"SLICE": ".ply", "SPLAT": ".splat", "SLICES": ""},
+}
 FORMAT_ITEMS = [
     ("PLY", "4D PLY", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
     ("USDC", "USDC (binary)", "USD for pipelines"),
@@ -36,11 +42,7 @@ FORMAT_ITEMS = [
     ("USDZ", "USDZ (package)", "USD in one file with all it needs"),
     ("SLICE", "3DGS PLY, this frame", "For 3DGS viewers and tools: what is visible at the current frame"),
     ("SPLAT", ".splat, this frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
-    (
-        "SLICES",
-        "3DGS PLY, all frames",
-        "A new folder with what the timeline shows at every frame of the scene",
-    ),
+    ("SLICES", "3DGS PLY, all frames", "A new folder with what the timeline shows at every frame of the scene"),
 ]
 MODE_ITEMS = [
     ("splats", "Splats", "A Gaussian splat prim, which older readers take as points"),
@@ -49,7 +51,7 @@ MODE_ITEMS = [
 ]
 
 
-def place(asset: Asset, matrix: np.ndarray) -> Asset:
+def with_place(asset: Asset, matrix: np.ndarray) -> Asset:
     """The asset with its place in the world in the clip (see `slices.placed`). Raises InputError."""
     clip = asset.clip
     own = np.diag([clip.scale, clip.scale, clip.scale, 1.0])
@@ -59,12 +61,12 @@ def place(asset: Asset, matrix: np.ndarray) -> Asset:
     return slices.placed(asset, matrix)
 
 
-def changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
+def places_and_changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
     """Where the object is at each of the frames, (F,4,4), or (1,4,4) where it stands still; and the names of
     the sliders that change."""
-    found = [(np.array(ob.matrix_world), asset_object.sliders(ob))]
-    if asset_object.may_change(ob):
-        found = [(np.array(ob.matrix_world), asset_object.sliders(ob)) for _ in asset_object.steps(frames, context)]
+    found = [(np.array(ob.matrix_world), slider_values(ob))]
+    if may_change(ob):
+        found = [(np.array(ob.matrix_world), slider_values(ob)) for _ in visit_frames(frames, context)]
     first = found[0][1]
     names = [k for k in first if k not in ("Look", "Point Size") and any(s[k] != first[k] for _, s in found)]
     return np.stack([m for m, _ in found]), names
@@ -87,83 +89,20 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
         return child_process.ask_worker(python, request)["complaints"]
 
 
-@contextmanager
-def original_usd(ob, path: Path, frames: range, context):
-    """Yields a .usdc of the objects that the asset was made from, over these frames: a temporary one for a .usdz, which
-    takes it in, else <name>_original.usdc beside `path`, which refers to it. Raises InputError."""
-    if path.suffix.lower() == ".usdz":
-        with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
-            _export_original(ob, Path(folder) / "original.usdc", frames, context)
-            yield Path(folder) / "original.usdc"
-        return
-    beside = path.with_name(f"{path.stem}_original.usdc")
-    new = not beside.exists()
-    with atomic(beside) as tmp:
-        _export_original(ob, tmp, frames, context)
-    try:
-        yield beside
-    except InputError:
-        if new:
-            beside.unlink(missing_ok=True)
-        raise
-
-
-def _export_original(ob, path: Path, frames: range, context) -> None:
-    """Blender's own USD export; selection, visibility and frame range are afterwards as they were."""
-    if not bpy.app.build_options.usd:
-        raise InputError("This Blender was built without USD, which With Original needs; switch that off.")
-    layer, scene = context.view_layer, context.scene
-    objects = [layer.objects[n] for n in ob.get("timesplat_source", []) if n in layer.objects]
-    if not objects:
-        raise InputError(f"{ob.name}: what it was made from is not in this view layer; switch With Original off.")
-    before = [(o, o.hide_get(), o.hide_viewport) for o in objects]
-    selected, active = list(layer.objects.selected), layer.objects.active
-    span, now = (scene.frame_start, scene.frame_end), (scene.frame_current, scene.frame_subframe)
-    why = "see its console"
-    try:
-        for o in selected:
-            o.select_set(False)
-        for o in objects:
-            o.hide_viewport = False
-            o.hide_set(False)
-            o.select_set(True)
-        scene.frame_start, scene.frame_end = frames.start, frames.stop - 1
-        bpy.ops.wm.usd_export(
-            filepath=str(path),
-            selected_objects_only=True,
-            export_animation=True,
-            export_armatures=False,  # deformed meshes at every frame, which every reader shows
-            export_shapekeys=False,
-            convert_world_material=False,
-        )
-    except RuntimeError as e:
-        why = " ".join(str(e).split())
-    finally:
-        scene.frame_start, scene.frame_end = span
-        scene.frame_set(now[0], subframe=now[1])
-        for o, hidden, off in before:
-            o.select_set(False)
-            o.hide_set(hidden)
-            o.hide_viewport = off
-        for o in selected:
-            o.select_set(True)
-        layer.objects.active = active
-    if not path.is_file():
-        raise InputError(f"{ob.name}: Blender could not export what it was made from ({why}); do without it.")
-
-
 def with_suffix(filepath: str, kind: str) -> str:
     """The path with the format's suffix, in place of another format's."""
     path = Path(filepath)
-    if path.suffix.lower() in SUFFIX.values():
+    if path.suffix.lower() in SUFFIXES.values():
         filepath = str(path.with_suffix(""))
-    return filepath + SUFFIX[kind]
+    return filepath + SUFFIXES[kind]
 
 
-def kind_of(filepath: str, default: str) -> str:
+def format_of(filepath: str, default: str) -> str:
     """The format that a path's suffix stands for: `default` if that has it or the suffix is of no format."""
     suffix = Path(filepath).suffix.lower()
-    return default if suffix in ("", SUFFIX[default]) else next((k for k, s in SUFFIX.items() if s == suffix), default)
+    if suffix in ("", SUFFIXES[default]):
+        return default
+    return next((k for k, s in SUFFIXES.items() if s == suffix), default)
 
 
 class TIMESPLAT_OT_export_asset(bpy.types.Operator):
@@ -197,7 +136,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
     @classmethod
     def poll(cls, context):
         cls.poll_message_set("Select a Timesplat asset, in Object Mode")
-        return context.mode == "OBJECT" and display.is_asset(context.object)
+        return context.mode == "OBJECT" and is_asset(context.object)
 
     def invoke(self, context, event):
         if not self.filepath:
@@ -210,7 +149,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
     def check(self, context):
         if self.format == self.checked:  # so that the name was changed: a suffix that is typed chooses the format
-            self.format = kind_of(self.filepath, self.format)
+            self.format = format_of(self.filepath, self.format)
         self.checked = self.format
         path = with_suffix(self.filepath, self.format)
         changed, self.filepath = path != self.filepath, path
@@ -230,12 +169,12 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
     def execute(self, context):
         if not self.properties.is_property_set("format"):
-            self.format = kind_of(self.filepath, self.format)
+            self.format = format_of(self.filepath, self.format)
         try:
             if not self.filepath:
                 raise InputError("No file was named; choose one.")
             path = Path(bpy.path.abspath(with_suffix(self.filepath, self.format)))
-            with busy(context):
+            with wait_cursor(context):
                 level, said = self.write(path, context)
         except InputError as e:
             self.report({"ERROR"}, str(e))
@@ -252,33 +191,33 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         context.view_layer.update()  # a script may have moved it just now
         frame = scene.frame_current_final
         if self.format in ("SLICE", "SPLAT"):
-            part = asset_object.moment(ob, asset_object.asset_of(ob), frame, self.apply_sliders)
+            part = moment(ob, asset_of(ob), frame, self.apply_sliders)
             count = slices.write_slice(path, part, frame, cut=0)
             if not part.opacity.any():
                 return "WARNING", f"Nothing is shown at frame {frame:g}; one clear Gaussian stands in."
             return "INFO", f"{count} Gaussians of frame {frame:g}."
         if self.format == "SLICES":
-            asset = asset_object.asset_of(ob)
+            asset = asset_of(ob)
             frames = range(scene.frame_start, scene.frame_end + 1) if self.apply_sliders else asset.clip.frames
-            steps = asset_object.steps(frames, context)
-            moments = ((f, asset_object.moment(ob, asset, f, self.apply_sliders)) for f in steps)
+            steps = visit_frames(frames, context)
+            moments = ((f, moment(ob, asset, f, self.apply_sliders)) for f in steps)
             with closing(steps):
                 return "INFO", f"{slices.write_moments(path, moments, path.name, cut=0)} files."
 
-        asset = asset_object.applied(ob) if self.apply_sliders else asset_object.asset_of(ob)
+        asset = with_sliders(ob) if self.apply_sliders else asset_of(ob)
         now = np.array(ob.matrix_world)
-        places, animated = changes(ob, asset.clip.frames, context)
+        places, animated = places_and_changes(ob, asset.clip.frames, context)
         rest, motion = slices.apart(places)
         lost = animated if self.apply_sliders else []
         if self.format == "PLY":
-            write_ply(path, place(asset, now))
+            write_ply(path, with_place(asset, now))
             lost = lost + ["place"] * (motion is not None)
             level, said = "INFO", f"{len(asset)} Gaussians."
         elif self.with_original:
             with original_usd(ob, path, asset.clip.frames, context) as original:
-                level, said = self.write_usd(path, place(asset, rest), original, motion, context)
+                level, said = self.write_usd(path, with_place(asset, rest), original, motion, context)
         else:
-            level, said = self.write_usd(path, place(asset, rest), None, motion, context)
+            level, said = self.write_usd(path, with_place(asset, rest), None, motion, context)
         if lost:
             said += f" Animated, but in the file as at frame {frame:g}: {', '.join(lost)}."
             said += " 3DGS PLY, all frames, keeps it."

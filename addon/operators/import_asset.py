@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
@@ -25,6 +24,7 @@ from ...model import formats, usd
 from ...model.asset import VISIBLE, read_ply
 from ..asset import display
 from ..runtime import child_process, worker_options
+from .common import wait_cursor
 
 LOOK_ITEMS = [
     ("Automatic", "Automatic", "Points in the viewport, Splats in renders"),
@@ -37,11 +37,13 @@ UP_ITEMS = [
     ("Y", "Y", "As in glTF and .spz"),
     ("-Y", "-Y", "As in 3D Gaussian Splatting and other photogrammetry"),
 ]
-TURNS = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # about X
+TURN_ABOUT_X = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # radians
 SUFFIXES = (*formats.SUFFIXES, *usd.SUFFIXES)
 
 
-def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tuple[formats.Loaded, np.ndarray | None]:
+def read_asset(
+    paths: list[Path], *, fps: float, frame_start: int, context=None
+) -> tuple[formats.Loaded, np.ndarray | None]:
     """One asset from a file of any kind, or from several that are one frame each; and its motion as a whole, if it
     has one (see `usd.read_moving`). Raises InputError."""
     if not any(p.suffix.lower() in usd.SUFFIXES for p in paths):
@@ -67,7 +69,7 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
         return formats.Loaded(read_ply(copy), "Z"), np.load(moves) if moves.exists() else None
 
 
-def animate(ob, frames: range, motion: np.ndarray) -> bool:
+def key_motion(ob, frames: range, motion: np.ndarray) -> bool:
     """Keys the object's transform so that it is at each frame where `motion` (F,4,4) takes it from where it is
     now. False where that cannot be keyed, because it shears."""
     places = [Matrix(m @ np.array(ob.matrix_world)) for m in motion]
@@ -84,18 +86,6 @@ def animate(ob, frames: range, motion: np.ndarray) -> bool:
         for key in ("location", "rotation_quaternion", "scale"):
             ob.keyframe_insert(key, frame=frame)
     return True
-
-
-@contextmanager
-def busy(context):
-    """The mouse pointer says so for as long."""
-    if window := context.window:  # none in background
-        window.cursor_modal_set("WAIT")
-    try:
-        yield
-    finally:
-        if window:
-            window.cursor_modal_restore()
 
 
 class TIMESPLAT_OT_import_asset(bpy.types.Operator):
@@ -171,8 +161,8 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
     def execute(self, context):
         try:
             paths = self.paths()
-            with busy(context):
-                loaded, motion = read(paths, fps=self.fps, frame_start=self.frame_start, context=context)
+            with wait_cursor(context):
+                loaded, motion = read_asset(paths, fps=self.fps, frame_start=self.frame_start, context=context)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
@@ -182,11 +172,11 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         asset, path = loaded.asset, paths[0]
         name = path.stem if len(paths) == 1 else path.parent.name
         ob = display.add_asset(asset, name, look=self.look, cut=self.opacity_cut, context=context)
-        ob.rotation_euler.x = TURNS[loaded.up if self.up == "AUTO" else self.up]
+        ob.rotation_euler.x = TURN_ABOUT_X[loaded.up if self.up == "AUTO" else self.up]
         note = loaded.note
         if motion is not None:
             context.view_layer.update()
-            if not animate(ob, asset.clip.frames, motion):
+            if not key_motion(ob, asset.clip.frames, motion):
                 note = "It moves in a way that shears it, which is left out: it stands where that starts."
         if self.use_clip:
             display.play_clip(context.scene, asset.clip)

@@ -9,6 +9,7 @@ when all is done.
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -18,9 +19,11 @@ from mathutils import Matrix
 from ...datagen.sequence import InputError
 from ...model.asset import read_ply, write_ply
 from .. import settings
-from ..asset import display
+from ..asset.display import add_asset
+from ..asset.parenting import follow
 from ..runtime import child_process, jobs, worker_options
-from ..runtime.capture import shoot
+from ..runtime.capture import start_capture
+from .common import errors_reported
 
 
 class TIMESPLAT_OT_reconstruct(settings.Settings, bpy.types.Operator):
@@ -39,25 +42,21 @@ class TIMESPLAT_OT_reconstruct(settings.Settings, bpy.types.Operator):
         return context.mode == "OBJECT"
 
     def invoke(self, context, event):
-        try:
+        with errors_reported(self):
             start(self, context)
-        except InputError as e:
-            self.report({"ERROR"}, str(e))
-            return {"CANCELLED"}
-        self.report({"INFO"}, "Reconstructing; Esc over a 3D view cancels.")
-        return {"FINISHED"}
+            self.report({"INFO"}, "Reconstructing; Esc over a 3D view cancels.")
+            return {"FINISHED"}
+        return {"CANCELLED"}
 
     def execute(self, context):
-        try:
+        with errors_reported(self):
             job = start(self, context)
             jobs.wait(job)
-        except InputError as e:
-            self.report({"ERROR"}, str(e))
-            return {"CANCELLED"}
-        if not bpy.app.background:
-            bpy.ops.ed.undo_push(message=self.bl_label)
-        self.report({"INFO"}, job.message)
-        return {"FINISHED"}
+            if not bpy.app.background:
+                bpy.ops.ed.undo_push(message=self.bl_label)
+            self.report({"INFO"}, job.message)
+            return {"FINISHED"}
+        return {"CANCELLED"}
 
 
 def request(chosen, context) -> dict:
@@ -91,7 +90,7 @@ def start(chosen, context) -> jobs.Job:
     begun = time.monotonic()
 
     def render(folder: Path) -> child_process.Child:
-        return shoot(shot | {"sequence": str(folder / "sequence")}, folder)
+        return start_capture(shot | {"sequence": str(folder / "sequence")}, folder)
 
     def reconstruct(folder: Path) -> child_process.Child:
         settings.learn(time.monotonic() - begun, pixels, shot["samples"])
@@ -108,21 +107,15 @@ def start(chosen, context) -> jobs.Job:
         "device": worker_options.device(context),
         "checkpoint": checkpoint or worker_options.checkpoint(context),
     }
-    captured = [o for o in settings.objects(chosen, context) if o.type not in ("LIGHT", "CAMERA")]
-    known = {o.session_uid for o in captured}  # names may change while it runs
-    roots = [o for o in captured if o.parent not in captured]
-    root, pose = (roots[0].session_uid, _pose(roots[0])) if len(roots) == 1 else (0, Matrix.Scale(0, 4))
+    originals = _Originals.of(settings.objects(chosen, context))
 
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
         if not (asked["budget"] or asked["refine"]):
             settings.learn_number(asked["method"], len(asset), pixels)
-        ob = display.add_asset(asset, "Timesplat", look=look, context=bpy.context)
-        originals = {o.session_uid: o for o in bpy.context.scene.objects if o.session_uid in known}
-        ob["timesplat_source"] = [o.name for o in originals.values()]
+        ob = add_asset(asset, "Timesplat", look=look, context=bpy.context)
+        originals.note_in(ob)
         ob["timesplat_lighting"] = shot["lighting"]
-        if pose.determinant() and root in originals and display.follow(ob, originals[root]):
-            ob.matrix_parent_inverse = pose.inverted()  # it may have been moved since
         said = f"{len(asset):,} Gaussians in {time.monotonic() - begun:.0f} s"
         if output:
             try:
@@ -135,6 +128,29 @@ def start(chosen, context) -> jobs.Job:
     return jobs.start(
         "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=context.scene.name
     )
+
+
+@dataclass(frozen=True)
+class _Originals:
+    """The captured objects, as the end of a Job finds them again: names may change while it runs."""
+
+    uids: frozenset[int]
+    root: int  # uid of the one that all others hang on; 0 where there are several
+    pose: Matrix  # of the root at the start
+
+    @classmethod
+    def of(cls, objects: list) -> _Originals:
+        captured = [o for o in objects if o.type not in ("LIGHT", "CAMERA")]
+        roots = [o for o in captured if o.parent not in captured]
+        root, pose = (roots[0].session_uid, _pose(roots[0])) if len(roots) == 1 else (0, Matrix.Scale(0, 4))
+        return cls(frozenset(o.session_uid for o in captured), root, pose)
+
+    def note_in(self, ob) -> None:
+        """Notes their names in the asset object, and lets it follow the root."""
+        found = {o.session_uid: o for o in bpy.context.scene.objects if o.session_uid in self.uids}
+        ob["timesplat_source"] = [o.name for o in found.values()]
+        if self.pose.determinant() and self.root in found and follow(ob, found[self.root]):
+            ob.matrix_parent_inverse = self.pose.inverted()  # it may have been moved since
 
 
 def _pose(ob) -> Matrix:

@@ -15,6 +15,7 @@ from bpy.props import EnumProperty
 
 from ...datagen.sequence import InputError
 from ..runtime import child_process, folders, install, jobs, worker_options
+from .common import errors_reported
 
 BUILDS = [
     ("cpu", "CPU", "Runs everywhere: about 300 MB to fetch, 1.3 GB on disk"),
@@ -31,17 +32,15 @@ class _Button:
 
     def execute(self, context):
         global last_job
-        try:
+        with errors_reported(self):
             if busy := jobs.running():
                 raise InputError(f"{busy[-1].label} runs; wait for its end, or cancel it.")
             last_job = self.start(context)
             if bpy.app.background:
                 jobs.wait(last_job)
                 self.report({"INFO"}, last_job.message)
-        except InputError as e:
-            self.report({"ERROR"}, str(e))
-            return {"CANCELLED"}
-        return {"FINISHED"}
+            return {"FINISHED"}
+        return {"CANCELLED"}
 
 
 class TIMESPLAT_OT_install_runtime(_Button, bpy.types.Operator):
@@ -70,8 +69,8 @@ class TIMESPLAT_OT_install_runtime(_Button, bpy.types.Operator):
             raise InputError(OFFLINE)
         if self.build == "cuda" and sys.platform == "darwin":
             raise InputError("CUDA does not exist for this computer; choose CPU, which has Metal too.")
-        stages = [_stage({"task": "install", "build": self.build}), _test_installed]
-        return jobs.start("Install runtime", stages, _installed, [0.85, 0.15], partly="The runtime is installed.")
+        stages = [_install_stage({"task": "install", "build": self.build}), _self_test_stage]
+        return jobs.start("Install runtime", stages, _finish_install, [0.85, 0.15], partly="The runtime is installed.")
 
 
 class TIMESPLAT_OT_uninstall_runtime(_Button, bpy.types.Operator):
@@ -88,7 +87,7 @@ class TIMESPLAT_OT_uninstall_runtime(_Button, bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def start(self, context):
-        return jobs.start("Uninstall runtime", [_stage({"task": "uninstall"})], _uninstalled)
+        return jobs.start("Uninstall runtime", [_install_stage({"task": "uninstall"})], _finish_uninstall)
 
 
 class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
@@ -98,18 +97,20 @@ class TIMESPLAT_OT_self_test(_Button, bpy.types.Operator):
     bl_label = "Self-Test"
 
     def start(self, context):
-        python, request = worker_options.worker_python(context), _test(context)
-        return jobs.start("Self-test", [lambda folder: child_process.start_worker(python, request, folder)], _tested)
+        python, request = worker_options.worker_python(context), _self_test_request(context)
+        return jobs.start(
+            "Self-test", [lambda folder: child_process.start_worker(python, request, folder)], _finish_self_test
+        )
 
 
-def _stage(request: dict):
+def _install_stage(request: dict):
     """A stage of a Job that runs `install` under Blender's own Python."""
     request = {**request, "folder": str(folders.runtime_folder())}
     command = [sys.executable, "-I", "-X", "utf8", str(Path(install.__file__))]
     return lambda folder: child_process.Child(command, {**request, "work": str(folder)}, folder)
 
 
-def _test(context) -> dict:
+def _self_test_request(context) -> dict:
     """What the worker is asked for. Raises InputError."""
     return {
         "task": "selftest",
@@ -118,25 +119,25 @@ def _test(context) -> dict:
     }
 
 
-def _test_installed(folder: Path) -> child_process.Child:
+def _self_test_stage(folder: Path) -> child_process.Child:
     """The stage after the installation: the self-test of what was installed."""
     worker_options.reload_installed_runtime()
     python = folders.runtime_folder() / worker_options.installed_runtime()["python"]
-    return child_process.start_worker(str(python), _test(bpy.context), folder)
+    return child_process.start_worker(str(python), _self_test_request(bpy.context), folder)
 
 
-def _installed(event: dict, folder: Path) -> str:
+def _finish_install(event: dict, folder: Path) -> str:
     runtime = worker_options.installed_runtime()
-    verdict = _tested(event, folder)
+    verdict = _finish_self_test(event, folder)
     return f"Runtime installed: torch {runtime['versions']['torch']}, {megabytes(runtime['bytes'])} on disk. {verdict}"
 
 
-def _uninstalled(event: dict, folder: Path) -> str:
+def _finish_uninstall(event: dict, folder: Path) -> str:
     worker_options.reload_installed_runtime()
     return f"Runtime removed: {megabytes(event['bytes'])} freed."
 
 
-def _tested(event: dict, folder: Path) -> str:
+def _finish_self_test(event: dict, folder: Path) -> str:
     self_test_report[:] = [str(line) for line in event["report"]]
     text = bpy.data.texts.get(TITLE) or bpy.data.texts.new(TITLE)
     text.from_string("\n".join(self_test_report) + "\n")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What renders the pictures, in a Blender of its own (`beside`). The request:
+"""Renders the pictures, in a background Blender (`background_blender`). The request:
 objects    full names of what is captured       cameras    full names of cameras, or [] for those of `rig`
 rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
 frames     scene frames                         in_turn    one camera a frame, instead of all of them
@@ -21,7 +21,7 @@ from ...datagen.sequence import InputError, Normalisation
 from . import background_blender, child_process
 
 
-def shoot(request: dict, folder: Path) -> child_process.Child:
+def start_capture(request: dict, folder: Path) -> child_process.Child:
     """Starts the capture of the open scene. Raises InputError."""
     return background_blender.start("addon.runtime.capture", request, folder)
 
@@ -39,11 +39,11 @@ def camera_shots(scene, cameras: list, frames: list[int], norm: Normalisation, i
         scene.frame_set(frame)
         for ob in [cameras[i % len(cameras)]] if in_turn else cameras:
             fov, shift = float(np.degrees(ob.data.angle)), (ob.data.shift_x, ob.data.shift_y)
-            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(_rigid(ob)), fov, shift))
+            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(_rigid_pose(ob)), fov, shift))
     return shots
 
 
-def _rigid(ob) -> np.ndarray:
+def _rigid_pose(ob) -> np.ndarray:
     """(4,4) float64: where a camera stands, which way it looks and which way is up, without scale, mirroring or shear.
     Raises InputError where its scale leaves no direction."""
     c2w = np.array(ob.matrix_world)
@@ -59,8 +59,8 @@ def _rigid(ob) -> np.ndarray:
 
 def _capture(request: dict, progress) -> dict:
     scene, frames = bpy.context.scene, request["frames"]
-    named = {ob.name_full: ob for ob in scene.objects}  # names alone are not unique: two libraries may use one
-    objects, cameras = ([named[n] for n in request[key]] for key in ("objects", "cameras"))
+    by_name = {ob.name_full: ob for ob in scene.objects}  # names alone are not unique: two libraries may use one
+    objects, cameras = ([by_name[n] for n in request[key]] for key in ("objects", "cameras"))
     progress(0.02, "measuring the object")
     simulate(frames[-1])
     norm, aabb = normalisation(frames, objects, name=scene.name)

@@ -3,53 +3,15 @@
 under way. Drawing reads settings and nothing else: no file, no evaluated object."""
 
 import bpy
-from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
-from bpy.props import EnumProperty
 
 from ...datagen.sequence import InputError
 from .. import settings
 from ..operators import add_cameras
+from ..operators.presets import PRESET_ITEMS
 from ..runtime import worker_options
 from ..runtime.folders import ADDON
 from . import job_rows
-
-PRESETS = {  # what they differ in
-    "DRAFT": {"size": 64, "samples": 8, "method": "lift", "budget": "ALL", "refine": 0.0},
-    "BALANCED": {"size": 128, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 0.0},
-    "FINE": {"size": 256, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 30.0},
-}
-PRESET_ITEMS = [
-    ("DRAFT", "Draft", "In a few seconds: small pictures, no network"),
-    ("BALANCED", "Balanced", "The best of a quarter of a minute"),
-    ("FINE", "Fine", "Larger pictures, a longer fit"),
-]
-
-
-class TIMESPLAT_OT_preset(bpy.types.Operator):
-    """Choose resolution, samples, method, refinement and number of Gaussians at once"""
-
-    bl_idname = "timesplat.preset"
-    bl_label = "Timesplat Preset"
-    bl_options = {"UNDO"}  # noqa: RUF012
-
-    preset: EnumProperty(name="Preset", items=PRESET_ITEMS)
-
-    def execute(self, context):
-        for key, value in PRESETS[self.preset].items():
-            setattr(context.scene.timesplat, key, value)
-        return {"FINISHED"}
-
-
-class TIMESPLAT_OT_preset_add(AddPresetBase, bpy.types.Operator):
-    """Add or remove a preset of your own"""
-
-    bl_idname = "timesplat.preset_add"
-    bl_label = "Add Timesplat Preset"
-    preset_menu = "TIMESPLAT_PT_presets"
-    preset_subdir = "timesplat"
-    preset_defines = ("settings = bpy.context.scene.timesplat",)
-    preset_values = tuple(f"settings.{k}" for k in settings.KEYS if k not in ("collection", "output"))
 
 
 class TIMESPLAT_PT_presets(PresetPanel, bpy.types.Panel):
@@ -88,14 +50,14 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row.label(text=f"{expected.pictures} pictures", icon="RENDER_RESULT")
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
             about = "at most" if chosen.budget == "NUMBER" else "about"
-            col.label(text=f"{about} {_round(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
+            col.label(text=f"{about} {_two_digits(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
         if not worker_options.has_worker_python(context):
             row = layout.row(align=True)
             row.label(text="No runtime yet", icon="ERROR")
             row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = ADDON
         row = layout.row()
         row.scale_y = 1.5
-        _reconstruct(row, chosen)
+        _reconstruct_button(row, chosen)
         job_rows.draw_jobs(layout)
         layout.operator("timesplat.import_asset", icon="IMPORT")
 
@@ -128,8 +90,8 @@ class TIMESPLAT_PT_cameras(_Sidebar, bpy.types.Panel):
 
     def draw(self, context):
         layout, chosen = self.layout, context.scene.timesplat
-        placed, said = settings.cameras(context)
-        layout.label(text=said, icon="OUTLINER_OB_CAMERA")
+        placed, description = settings.cameras(context)
+        layout.label(text=description, icon="OUTLINER_OB_CAMERA")
         if placed:
             layout.prop(chosen, "in_turn")
         grid = layout.grid_flow(columns=2, align=True, even_columns=True)
@@ -163,7 +125,7 @@ class TIMESPLAT_MT_object(bpy.types.Menu):
 
     def draw(self, context):
         layout = self.layout
-        _reconstruct(layout, context.scene.timesplat)
+        _reconstruct_button(layout, context.scene.timesplat)
         layout.operator("timesplat.cancel")
         layout.operator("timesplat.bring")
         layout.operator("timesplat.log")
@@ -173,7 +135,7 @@ class TIMESPLAT_MT_object(bpy.types.Menu):
         layout.operator("timesplat.self_test")
 
 
-def _reconstruct(layout, chosen) -> None:
+def _reconstruct_button(layout, chosen) -> None:
     """The button, with the scene's settings."""
     operator = layout.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
     for key in settings.KEYS:
@@ -188,14 +150,12 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
-def _round(count: int) -> int:
+def _two_digits(count: int) -> int:
     """Two digits of it: more are not known."""
     return round(count, 2 - len(str(count)))
 
 
 CLASSES = (
-    TIMESPLAT_OT_preset,
-    TIMESPLAT_OT_preset_add,
     TIMESPLAT_PT_presets,
     TIMESPLAT_PT_panel,
     TIMESPLAT_PT_capture,

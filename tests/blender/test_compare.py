@@ -8,7 +8,8 @@ from timesplat.model.asset import Asset, Clip, write_ply
 
 SCENE = """
 part("addon").register()
-display, compare = part("addon.asset.display"), part("addon.operators.compare")
+display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
+compare = part("addon.operators.compare")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene = bpy.context.scene
 bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5, segments=48, ring_count=24)
@@ -30,7 +31,7 @@ camera.location, camera.rotation_euler = (0, -3, 0), (np.pi / 2, 0, 0)
 scene.render.resolution_x, scene.render.resolution_y = 300, 200
 scene.frame_set(7, subframe=0.25)
 def state():
-    look = part("addon.asset.nodes").get_input(display.sampler(ob), "Look")
+    look = sliders.get_input(sliders.asset_modifier(ob), "Look")
     return [scene.frame_current_final, look, scene.render.engine, scene.render.resolution_x, scene.render.filepath,
             scene.render.film_transparent, ball.hide_render, bpy.context.object.name, bpy.context.scene.name,
             *(len(getattr(bpy.data, x)) for x in ("objects", "scenes", "cameras", "lights", "worlds", "meshes"))]

@@ -36,12 +36,13 @@ def shown(ob, *names):
     return {}
 """
 EVALUATE = """
-display, asset = part("addon.asset.display"), part("model.asset").read_ply(sys.argv[1])
+display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
+asset = part("model.asset").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
 scene, out = bpy.context.scene, {}
 for look in ("Points", "Splats"):
-    display.set_input(ob.modifiers[0], "Look", look)
+    sliders.set_input(ob.modifiers[0], "Look", look)
     for frame in (10.0, 16.25, 21.5, 32.9, 33.0, 2.0, 40.5):
         scene.frame_set(int(frame), subframe=frame % 1)
         out[f"{look} {frame}"] = shown(ob, "position", "gs_alpha", "radius", "gs_color")
@@ -75,18 +76,18 @@ def test_evaluated_attributes_are_those_of_numpy(blender, tmp_path):
 
 
 SLIDERS = """
-display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
+display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
 asset, cases = part("model.asset").read_ply(sys.argv[1]), json.loads(sys.argv[2])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
-modifier, scene, out = display.sampler(ob), bpy.context.scene, []
+modifier, scene, out = sliders.asset_modifier(ob), bpy.context.scene, []
 order = np.empty(len(asset), np.float32)
 ob.data.attributes["gs_order"].data.foreach_get("value", order)
-start = {name: nodes.get_input(modifier, name) for name in nodes.SLIDERS}
+start = {name: sliders.get_input(modifier, name) for name in sliders.SLIDERS}
 for case in cases:
     for name, value in {**start, **case["set"]}.items():
-        display.set_input(modifier, name, value)
-    assert {**start, **case["set"]}.keys() == {n: nodes.get_input(modifier, n) for n in nodes.SLIDERS}.keys()
+        sliders.set_input(modifier, name, value)
+    assert {**start, **case["set"]}.keys() == {n: sliders.get_input(modifier, n) for n in sliders.SLIDERS}.keys()
     scene.frame_set(int(case["frame"] // 1), subframe=case["frame"] % 1)
     out.append(shown(ob, "position", "gs_alpha"))
 tell(out=out, order=order.tolist(), start=start)
@@ -117,7 +118,7 @@ FRAMES = (-40.75, 10.0, 21.5, 33.0, 34.5, 57.25, 101.0)
 
 
 def expected_time(s, frame):
-    """The model time that the documentation promises, written another way than nodes.py and edit.py have it."""
+    """The model time that the documentation promises, written another way than in nodes.py and apply_sliders.py."""
     start, end = s["Frame Start"], s["Frame End"]
     moved = start + (frame - start - s["Time Offset"]) * s["Time Scale"]
     if start == end:
@@ -158,13 +159,13 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
     asset = make(200)
     write_ply(tmp_path / "a.ply", asset)
     save = """
-    display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
+    display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
     asset = part("model.asset").read_ply(sys.argv[1])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     ob = display.add_asset(asset, "a", look="Points", cut=0.05)
     for frame, value in ((10, 0.0), (30, 20.0)):
-        owner, key = nodes.rna(display.sampler(ob), "Time Offset")
-        display.set_input(display.sampler(ob), "Time Offset", value)
+        owner, key = sliders.input_property(sliders.asset_modifier(ob), "Time Offset")
+        sliders.set_input(sliders.asset_modifier(ob), "Time Offset", value)
         assert owner.keyframe_insert(key, frame=frame)
     bpy.ops.wm.save_as_mainfile(filepath=sys.argv[2])
     tell()
@@ -188,7 +189,8 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
 
 PANEL = """
 import types
-display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
+display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
+result_panel = part("addon.ui.result_panel")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(part("model.asset").read_ply(sys.argv[1]), "a")
 drawn, buttons, labels = {}, [], []
@@ -206,24 +208,24 @@ class Layout:
         drawn[text] = key
 panel = types.SimpleNamespace(layout=Layout())
 scene = bpy.context.scene
-display.set_input(display.sampler(ob), "Crop", True)
+sliders.set_input(sliders.asset_modifier(ob), "Crop", True)
 for transform in ("AgX", "Standard"):
     scene.view_settings.view_transform = transform
     buttons.clear()
-    display.TIMESPLAT_PT_result.draw(panel, bpy.context)
+    result_panel.TIMESPLAT_PT_result.draw(panel, bpy.context)
     if transform == "AgX":
         warned = list(buttons)
 all_drawn = list(drawn)
 drawn.clear()
-display.set_input(display.sampler(ob), "Crop", False)
-display.TIMESPLAT_PT_result.draw(panel, bpy.context)
+sliders.set_input(sliders.asset_modifier(ob), "Crop", False)
+result_panel.TIMESPLAT_PT_result.draw(panel, bpy.context)
 scene.view_settings.view_transform = "AgX"
 part("addon").register()
 bpy.ops.timesplat.set_standard()
-poll = [display.TIMESPLAT_PT_result.poll(bpy.context)]
+poll = [result_panel.TIMESPLAT_PT_result.poll(bpy.context)]
 bpy.ops.object.delete()
-poll.append(display.TIMESPLAT_PT_result.poll(bpy.context))
-tell(drawn=all_drawn, uncropped=list(drawn), sliders=list(nodes.SLIDERS), warned=warned, buttons=buttons,
+poll.append(result_panel.TIMESPLAT_PT_result.poll(bpy.context))
+tell(drawn=all_drawn, uncropped=list(drawn), sliders=list(sliders.SLIDERS), warned=warned, buttons=buttons,
      labels=labels, poll=poll, transform=scene.view_settings.view_transform)
 part("addon").unregister()
 """
@@ -240,19 +242,19 @@ def test_the_panel_shows_the_modifiers_own_sliders(blender, tmp_path):
 
 
 NATIVE = """
-display, nodes = part("addon.asset.display"), part("addon.asset.nodes")
+display, nodes, sliders = (part(f"addon.asset.{x}") for x in ("display", "nodes", "sliders"))
 asset = part("model.asset").read_ply(sys.argv[1])
 if bpy.app.version < (5, 2):
     tell(old=True)
     sys.exit()
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
-if not nodes.NATIVE:  # what Blender 5.3 has in the group
+if not sliders.NATIVE:  # what Blender 5.3 has in the group
     display.write_attributes(ob.data, nodes.native_attributes(asset))
-tree = display.sampler(ob).node_group = display.sampler(ob).node_group.copy()
+tree = sliders.asset_modifier(ob).node_group = sliders.asset_modifier(ob).node_group.copy()
 n = nodes.Nodes(tree)
 placed, end = (next(x for x in tree.nodes if x.bl_idname == k) for k in ("GeometryNodeSetPosition", "NodeGroupOutput"))
-n.put(end.inputs[0], nodes.native(n, placed.outputs[0]))
+n.put(end.inputs[0], nodes.native_splats(n, placed.outputs[0]))
 bpy.context.scene.frame_set(20, subframe=0.5)
 tell(old=False, got=shown(ob, "position", "scale", "rotation", "radiance:base"))
 """
@@ -275,7 +277,8 @@ def test_blenders_own_splats_get_the_attributes_that_they_are_known_by(blender, 
 
 
 FOLLOW = """
-display, asset = part("addon.asset.display"), part("model.asset").read_ply(sys.argv[1])
+display, parenting = part("addon.asset.display"), part("addon.asset.parenting")
+asset = part("model.asset").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene, told = bpy.context.scene, {}
 def made(name, parent=None):
@@ -288,7 +291,7 @@ original.parent, original.location, original.scale = above, (1, 2, 3), (2,) * 3
 above.location, above.rotation_euler = (0, 0, 5), (0.3, 0.2, 0.1)
 ob = display.add_asset(asset, "a", look="Points")
 before = shown(ob, "position")["world"]
-told["did"] = display.follow(ob, original)
+told["did"] = parenting.follow(ob, original)
 scene.frame_set(20)
 scene.frame_set(1)
 told["stays"] = np.abs(np.array(before) - shown(ob, "position")["world"]).max().item()
@@ -303,8 +306,8 @@ child.parent = keyed
 driven, shape = made("driven"), made("shape")
 driven.driver_add("location", 0)
 shape.keyframe_insert("hide_render", frame=1)
-told["refused"] = [display.follow(ob, x) for x in (keyed, held, child, driven, ob)]
-told["shape"] = display.follow(ob, shape)
+told["refused"] = [parenting.follow(ob, x) for x in (keyed, held, child, driven, ob)]
+told["shape"] = parenting.follow(ob, shape)
 tell(**told)
 """
 
@@ -317,12 +320,12 @@ def test_it_follows_an_original_that_stands_still_by_itself(blender, tmp_path):
 
 
 RENDER = """
-from timesplat.addon.asset import display
-display.save_blend(sys.argv[1], sys.argv[2])
+from timesplat.addon.asset import blend_file, sliders
+blend_file.save_blend(sys.argv[1], sys.argv[2])
 bpy.ops.wm.open_mainfile(filepath=sys.argv[2])
 scene = bpy.context.scene
 ob = next(o for o in bpy.data.objects if o.get("timesplat"))
-display.set_input(ob.modifiers[0], "Look", "Splats")
+sliders.set_input(ob.modifiers[0], "Look", "Splats")
 scene.render.resolution_x = scene.render.resolution_y = 48
 scene.cycles.samples, scene.cycles.filter_width, scene.cycles.use_adaptive_sampling = 32, 0.01, False
 scene.render.film_transparent = True

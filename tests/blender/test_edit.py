@@ -15,8 +15,8 @@ from .test_display import expected_time
 
 START = """
 part("addon").register()
-display, nodes, held = (part(f"addon.asset.{x}") for x in ("display", "nodes", "asset_object"))
-edit = part("addon.operators.edit")
+display, sliders, edit = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit"))
+holding, applying = part("addon.asset.asset_object"), part("addon.asset.apply_sliders")
 asset_module = part("model.asset")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 asset, scene = asset_module.read_ply(sys.argv[1]), bpy.context.scene
@@ -27,7 +27,7 @@ def save(asset, path):
     return [c.fps, c.frame_start, c.frame_end, c.scale, list(c.translation), c.pixel]
 def set_all(values):
     for name, value in values.items():
-        display.set_input(display.sampler(ob), name, value)
+        sliders.set_input(sliders.asset_modifier(ob), name, value)
 def refused(call, *args, **options):
     try:
         call(*args, **options)
@@ -58,17 +58,17 @@ def load(path):
 def test_an_object_gives_the_asset_back(start, tmp_path):
     code = """
     out = sys.argv[2]
-    first = save(edit.asset_of(ob), out + "/first.npz")
+    first = save(holding.asset_of(ob), out + "/first.npz")
     ob.location.x += 3
     set_all({"Density": 0.5, "Crop": True, "Lifetime Scale": 3.0})
-    second = save(edit.asset_of(ob), out + "/second.npz")
-    plain = save(edit.applied(ob), out + "/applied.npz")
+    second = save(holding.asset_of(ob), out + "/second.npz")
+    plain = save(applying.with_sliders(ob), out + "/applied.npz")
     bpy.ops.wm.save_as_mainfile(filepath=out + "/a.blend")
     bpy.ops.wm.open_mainfile(filepath=out + "/a.blend")
     ob = bpy.data.objects["a"]
-    third = save(edit.asset_of(ob), out + "/third.npz")
+    third = save(holding.asset_of(ob), out + "/third.npz")
     ob.data.attributes.remove(ob.data.attributes["gs_t"])
-    tell(clips=[first, second, third], broken=refused(edit.asset_of, ob), camera=refused(edit.asset_of, None))
+    tell(clips=[first, second, third], broken=refused(holding.asset_of, ob), camera=refused(holding.asset_of, None))
     """
     asset, told = start(code, make(5000))
     clip = asset.clip
@@ -93,8 +93,8 @@ def test_an_object_of_an_older_version_gives_its_asset_too(start, tmp_path):
     for item in list(group.interface.items_tree):
         if item.item_type == "SOCKET" and item.name in ("Repeat", "Time Scale", "Crop"):
             group.interface.remove(item)
-    clip = save(edit.applied(ob), sys.argv[2] + "/old.npz")
-    tell(clip=clip, fps=scene.render.fps, repeat=nodes.get_input(display.sampler(ob), "Repeat"))
+    clip = save(applying.with_sliders(ob), sys.argv[2] + "/old.npz")
+    tell(clip=clip, fps=scene.render.fps, repeat=sliders.get_input(sliders.asset_modifier(ob), "Repeat"))
     """
     asset, told = start(code, make(50, clip=Clip(24, 10, 33, 2.5, (1.0, -2.0, 3.0))))
     assert told["clip"] == [told["fps"], 10, 33, 2.5, [1.0, -2.0, 3.0], 0.0] and told["repeat"] == "Hold"
@@ -120,20 +120,20 @@ def test_applied_sliders_show_the_same(start, tmp_path):
     """At every frame of the new clip the applied asset is what the object with its sliders shows."""
     code = """
     cases, out, clips = json.loads(sys.argv[3]), sys.argv[2], []
-    base = {name: nodes.get_input(display.sampler(ob), name) for name in nodes.SLIDERS}
+    base = {name: sliders.get_input(sliders.asset_modifier(ob), name) for name in sliders.SLIDERS}
     for i, case in enumerate(cases):
         set_all({**base, **case})
-        clips.append(save(edit.applied(ob), f"{out}/{i}.npz"))
-    order = held.read(ob.data, "gs_order", 1, "value").tolist()
+        clips.append(save(applying.with_sliders(ob), f"{out}/{i}.npz"))
+    order = holding.read_attribute(ob.data, "gs_order", 1, "value").tolist()
     shown = {}
     for frame in (10.0, 17.5):
         set_all({**base, **cases[5]})
-        position, mask = held.shown(ob, frame)
+        position, mask = applying.shown_gaussians(ob, frame)
         shown[frame] = [position.tolist(), mask.tolist()]
     set_all({**base, "Repeat": "Loop"})
-    loop = refused(edit.applied, ob)
+    loop = refused(applying.with_sliders, ob)
     set_all({**base, "Density": 0.0})
-    tell(clips=clips, order=order, loop=loop, none=refused(edit.applied, ob), base=base, shown=shown)
+    tell(clips=clips, order=order, loop=loop, none=refused(applying.with_sliders, ob), base=base, shown=shown)
     """
     asset, told = start(code, make(400), json.dumps([c for c, _ in CASES]))
     order = np.array(told["order"], np.float32)
@@ -179,7 +179,7 @@ def state():
             "parent": ob.parent.name, "animated": bool(ob.animation_data.action), "world": list(ob.matrix_world.col[3]),
             "materials": [m.name for m in ob.data.materials], "active": bpy.context.object.name,
             "selected": sorted(x.name for x in bpy.context.selected_objects), "kind": ob.data.rna_type.identifier,
-            "sliders": {n: nodes.get_input(display.sampler(ob), n) for n in nodes.SLIDERS},
+            "sliders": {n: sliders.get_input(sliders.asset_modifier(ob), n) for n in sliders.SLIDERS},
             "objects": len(bpy.data.objects), "datas": len(bpy.data.meshes) + len(bpy.data.pointclouds)}
 def left():
     ids = np.empty(len(ob.data.attributes["mine"].data), np.int32)
@@ -193,8 +193,8 @@ for options in ({"what": "OUTSIDE"}, {"what": "FAINT", "opacity": 0.3}, {"what":
 told["again"] = list(bpy.ops.timesplat.delete(what="LARGE", size=0.07))
 told["all"] = refused(bpy.ops.timesplat.delete, what="LARGE", size=0.0)
 told["after"] = state()
-save(edit.asset_of(ob), out + "/left.npz")
-part("model.asset").write_ply(out + "/left.ply", edit.applied(ob))
+save(holding.asset_of(ob), out + "/left.npz")
+part("model.asset").write_ply(out + "/left.ply", applying.with_sliders(ob))
 evaluated = bpy.context.evaluated_depsgraph_get()
 set_all({"Crop Min": [-0.2, -0.2, -0.2], "Crop Max": [0.2, 0.2, 0.2]})
 bpy.ops.timesplat.delete(what="INSIDE")
@@ -262,8 +262,8 @@ if told["has"]:
     bpy.ops.pointcloud.delete()
     told["poll"] = bpy.ops.timesplat.delete.poll()
     bpy.ops.object.mode_set(mode="OBJECT")
-    save(edit.asset_of(ob), sys.argv[2] + "/left.npz")
-    part("model.asset").write_ply(sys.argv[2] + "/left.ply", edit.applied(ob))
+    save(holding.asset_of(ob), sys.argv[2] + "/left.npz")
+    part("model.asset").write_ply(sys.argv[2] + "/left.ply", applying.with_sliders(ob))
 tell(**told)
 """
 
@@ -293,14 +293,14 @@ new = bpy.context.object
 bpy.context.view_layer.update()
 told["same"] = (np.array(new.matrix_world) - np.array(ob.matrix_world)).tolist()
 told["name"], told["hidden"] = new.name, [ob.hide_get(), ob.hide_render, new.hide_get(), new.hide_render]
-told["sliders"] = {n: nodes.get_input(display.sampler(new), n) for n in nodes.SLIDERS}
-told["clip"] = save(edit.asset_of(new), sys.argv[2] + "/new.npz")
+told["sliders"] = {n: sliders.get_input(sliders.asset_modifier(new), n) for n in sliders.SLIDERS}
+told["clip"] = save(holding.asset_of(new), sys.argv[2] + "/new.npz")
 told["source"] = list(new["timesplat_source"])
-told["order"] = held.read(ob.data, "gs_order", 1, "value").tolist()
+told["order"] = holding.read_attribute(ob.data, "gs_order", 1, "value").tolist()
 bpy.context.view_layer.objects.active = ob
 told["empty"] = refused(bpy.ops.timesplat.bake, frame_start=5, frame_end=4)
 bpy.ops.timesplat.bake(frame_start=100, frame_end=120)
-told["after"] = save(edit.asset_of(bpy.context.object), sys.argv[2] + "/after.npz")
+told["after"] = save(holding.asset_of(bpy.context.object), sys.argv[2] + "/after.npz")
 ob.keyframe_insert("location", frame=1)
 ob.location.x += 1
 ob.keyframe_insert("location", frame=30)

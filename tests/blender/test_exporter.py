@@ -16,7 +16,8 @@ EXPORT = """
 import atexit
 part("addon").register()
 atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
-display, edit, asset = part("addon.asset.display"), part("addon.operators.edit"), part("model.asset")
+display, sliders, edit, holding = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit", "asset_object"))
+asset = part("model.asset")
 folder = sys.argv[1] + os.sep
 ob = display.add_asset(asset.read_ply(folder + "in.ply"), "Walk. 1")
 scene = bpy.context.scene
@@ -52,13 +53,13 @@ def test_4d_ply_comes_back_the_same(blender, folder):
 
 def test_deleted_gaussians_and_sliders_reach_the_file(blender, folder):
     code = """
-edit.keep(ob, np.arange(120) % 3 > 0)
+edit.keep_gaussians(ob, np.arange(120) % 3 > 0)
 done = [save("kept.ply")]
-display.set_input(display.sampler(ob), "Time Scale", 2.0)
-display.set_input(display.sampler(ob), "Lifetime Scale", 0.5)
+sliders.set_input(sliders.asset_modifier(ob), "Time Scale", 2.0)
+sliders.set_input(sliders.asset_modifier(ob), "Lifetime Scale", 0.5)
 done += [save("applied.ply"), save("raw.ply", apply_sliders=False)]
 bpy.ops.timesplat.import_asset(filepath=folder + "kept.ply")
-tell(done=done, again=len(edit.asset_of(bpy.context.object)))
+tell(done=done, again=len(holding.asset_of(bpy.context.object)))
 """
     told = blender(EXPORT + code, folder)
     assert told["done"] == [["FINISHED"]] * 3 and told["again"] == 80
@@ -127,7 +128,7 @@ scene.frame_set(17)
 done.append(save("seventeen.ply", format="SLICE"))
 done.append(list(bpy.ops.timesplat.import_asset(filepath=folder + "frames", frame_start=10)))
 new, graph = bpy.context.object, bpy.context.evaluated_depsgraph_get()
-edit_asset = edit.asset_of(new)
+edit_asset = holding.asset_of(new)
 shown = {}
 for frame in (10, 17, 33):
     position, alpha = edit_asset.at(edit_asset.frame_to_time(frame))
@@ -173,13 +174,13 @@ operator.write = write
 def test_slices_are_what_the_timeline_shows(blender, folder, repeat):
     """At every frame of the scene, with animated sliders and a place that is animated; grown from nothing."""
     code = f"""
-modifier = display.sampler(ob)
-display.set_input(modifier, "Repeat", {repeat!r})
-display.set_input(modifier, "Time Scale", 1.5)
+modifier = sliders.asset_modifier(ob)
+sliders.set_input(modifier, "Repeat", {repeat!r})
+sliders.set_input(modifier, "Time Scale", 1.5)
 def slide(name, values):
     for frame, value in values.items():
-        display.set_input(modifier, name, value)
-        owner, key = part("addon.asset.nodes").rna(modifier, name)
+        sliders.set_input(modifier, name, value)
+        owner, key = sliders.input_property(modifier, name)
         owner.keyframe_insert(key, frame=frame)
 slide("Density", {{8: 1.0, 30: 0.4, 36: 0.0}})
 slide("Opacity Cut", {{8: 0.0, 30: 0.3}})
@@ -385,10 +386,10 @@ part("addon").register()
 exporter = part("addon.operators.export_asset")
 menu = [d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs]
 part("addon").unregister()
-f, k = exporter.with_suffix, exporter.kind_of
+f, k = exporter.with_suffix, exporter.format_of
 tell(names=[f("/x/a", "USDZ"), f("/x/a.ply", "USDC"), f("/x/a.v2", "PLY"), f("/x/a.v2.USDA", "SLICES")],
      typed=[k("a.usdz", "PLY"), k("a", "USDA"), k("a.v2", "USDA"), k("a.PLY", "SLICE"), k("a.ply", "SLICES")],
-     kinds=sorted(exporter.SUFFIX) == sorted(i[0] for i in exporter.FORMAT_ITEMS), menu=menu,
+     kinds=sorted(exporter.SUFFIXES) == sorted(i[0] for i in exporter.FORMAT_ITEMS), menu=menu,
      gone=[d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs])
 """
     told = blender(code)

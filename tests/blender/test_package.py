@@ -86,7 +86,7 @@ import time
 def use():
     done = bpy.ops.timesplat.import_asset(filepath=sys.argv[1], use_clip=True, look="Splats")
     ob = bpy.context.object
-    said = dict(done=list(done), count=part("addon.operators.edit").asset_of(ob).xyz.shape[0], scale=list(ob.scale),
+    said = dict(done=list(done), count=part("addon.asset.asset_object").asset_of(ob).xyz.shape[0], scale=list(ob.scale),
                 at=list(ob.location), range=[bpy.context.scene.frame_start, bpy.context.scene.frame_end],
                 fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
     bpy.ops.timesplat.export_asset(filepath=sys.argv[3])

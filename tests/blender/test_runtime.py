@@ -316,7 +316,8 @@ if able:
                    folder=str(folders.runtime_folder()), message=jobs.JOBS[-1].message, text=text(),
                    asked=asked[:])
     done = [sys.argv[1], "-c", "print('{\"event\": \"done\"}')"]
-    stage, buttons._stage = buttons._stage, lambda request: lambda folder: process.Child(done, request, folder)
+    stage = buttons._install_stage
+    buttons._install_stage = lambda request: lambda folder: process.Child(done, request, folder)
     report[:] = ["ok lift: fine", "FAILED: network: no weights; copy them again."]
     result |= dict(ill=op("install_runtime"), one=text(), stays=options.installed_runtime() == told)
     report.clear()
@@ -326,7 +327,7 @@ if able:
         options.worker_python()
     except Exception as e:
         result["dangling"] = str(e)
-    buttons._stage = stage
+    buttons._install_stage = stage
     result |= dict(removed=op("uninstall_runtime"), after=left(), state=options.installed_runtime())
     result["other"] = options.worker_python()
 tell(**result)
@@ -370,7 +371,8 @@ def cwd(p):
         return ""
 seen = []
 for until in ("virtual", "importing"):
-    job = jobs.start("Install runtime", [buttons._stage({"task": "install", "build": "cpu"})], buttons._installed)
+    stage = buttons._install_stage({"task": "install", "build": "cpu"})
+    job = jobs.start("Install runtime", [stage], buttons._finish_install)
     while until not in job.text and job.state == "running":
         job.advance(0.1)
     busy = op("install_runtime") if until == "importing" else ""
