@@ -64,7 +64,7 @@ def test_floors(name):
 
 ADDON = [n for n in NAMES if n.startswith("addon/")]
 # Storeys of the top floor, lowest first: each may use those below it, and its own rooms where that closes no circle.
-STOREYS = ("asset", "runtime", "settings", "operators", "ui")
+STOREYS = ("asset", "runtime", "settings", "estimates", "operators", "ui")
 ATTIC = ("", "command_line")  # `addon` itself, which registers all of them, and the command line
 
 

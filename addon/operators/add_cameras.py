@@ -80,14 +80,15 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
             return {"CANCELLED"}
         for ob in list(context.view_layer.objects.selected):
             ob.select_set(False)
-        if self.replace and (old := bpy.data.collections.get(settings.RIG)):
+        if self.replace and (old := bpy.data.collections.get(settings.RIG_COLLECTION)):
             for ob in [o for o in old.objects if o.type == "CAMERA"]:  # batch_remove crashes 4.3 when it is undone
                 data = ob.data
                 bpy.data.objects.remove(ob)
                 if not data.users:
                     bpy.data.cameras.remove(data)
-        collection = bpy.data.collections.get(settings.RIG) or bpy.data.collections.new(settings.RIG)
-        if settings.RIG not in scene.collection.children:
+        name = settings.RIG_COLLECTION
+        collection = bpy.data.collections.get(name) or bpy.data.collections.new(name)
+        if name not in scene.collection.children:
             scene.collection.children.link(collection)
         placed: dict[str, list] = {}
         for shot in shots(self.rig, self.count, math.degrees(self.elevation), self.distance, frames):

@@ -18,7 +18,7 @@ from mathutils import Matrix
 
 from ...datagen.sequence import InputError
 from ...model.asset import read_ply, write_ply
-from .. import settings
+from .. import estimates, settings
 from ..asset.display import add_asset
 from ..asset.parenting import follow
 from ..runtime import child_process, jobs, worker_options
@@ -85,7 +85,7 @@ def start(chosen, context) -> jobs.Job:
     if checkpoint and not Path(checkpoint).is_file():
         raise InputError(f"{checkpoint}: no such checkpoint; correct it, or leave it empty.")
     output = _output(chosen.output)
-    expected = settings.estimate(chosen, context)
+    expected = estimates.estimate(chosen, context)
     pixels = expected.pictures * chosen.size**2
     begun = time.monotonic()
 
@@ -93,7 +93,7 @@ def start(chosen, context) -> jobs.Job:
         return start_capture(shot | {"sequence": str(folder / "sequence")}, folder)
 
     def reconstruct(folder: Path) -> child_process.Child:
-        settings.learn(time.monotonic() - begun, pixels, shot["samples"])
+        estimates.learn_speed(time.monotonic() - begun, pixels, shot["samples"])
         places = {"sequence": str(folder / "sequence"), "asset": str(folder / "asset.ply")}
         return child_process.start_worker(python, asked | places, folder)
 
@@ -112,7 +112,7 @@ def start(chosen, context) -> jobs.Job:
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
         if not (asked["budget"] or asked["refine"]):
-            settings.learn_number(asked["method"], len(asset), pixels)
+            estimates.learn_number(asked["method"], len(asset), pixels)
         ob = add_asset(asset, "Timesplat", look=look, context=bpy.context)
         originals.note_in(ob)
         ob["timesplat_lighting"] = shot["lighting"]

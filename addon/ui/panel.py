@@ -6,7 +6,7 @@ import bpy
 from bl_ui.utils import PresetPanel
 
 from ...datagen.sequence import InputError
-from .. import settings
+from .. import estimates, settings
 from ..operators import add_cameras
 from ..operators.presets import PRESET_ITEMS
 from ..runtime import worker_options
@@ -41,7 +41,7 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row.operator("timesplat.preset", text=name).preset = key
         col = layout.column(align=True)
         try:
-            expected = settings.estimate(chosen, context)
+            expected = estimates.estimate(chosen, context)
         except InputError as e:
             col.label(text=str(e), icon="ERROR")
         else:

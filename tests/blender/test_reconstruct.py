@@ -151,7 +151,7 @@ def test_what_cannot_be_done_is_said(installed, tmp_path):
 
 SELECT = """
 part("addon").register()
-settings = part("addon.settings")
+settings, estimates = part("addon.settings"), part("addon.estimates")
 scene, chosen = bpy.context.scene, bpy.context.scene.timesplat
 ranges = [[list(settings.spread(1, e, n)) for n in (1, 2, 8, 24)] for e in (1, 2, 24, 40, 250)]
 names = lambda: sorted(o.name for o in settings.objects(chosen, bpy.context))
@@ -179,10 +179,10 @@ own = list(settings.frames(chosen, scene))
 said = [settings.cameras(bpy.context)[1]]
 chosen.source = "SCENE"
 bpy.ops.timesplat.add_cameras(rig="ORBIT", count=5)
-estimates = []
+pictures = []
 for every, turn in ((7, False), (7, True)):
     chosen.every, chosen.in_turn = every, turn
-    estimates.append(settings.estimate(chosen, bpy.context).pictures)
+    pictures.append(estimates.estimate(chosen, bpy.context).pictures)
 said.append(settings.cameras(bpy.context)[1])
 bpy.ops.object.select_all(action="DESELECT")
 said.append(settings.cameras(bpy.context)[1])
@@ -192,13 +192,13 @@ chosen.in_turn, chosen.every = True, 50
 counts = {}
 for budget, refine, size in (("ALL", 0, 128), ("SHARE", 0, 128), ("SHARE", 0, 32), ("NUMBER", 0, 128), ("ALL", 9, 256)):
     chosen.budget, chosen.refine, chosen.size, chosen.number = budget, refine, size, 100
-    e = settings.estimate(chosen, bpy.context)
+    e = estimates.estimate(chosen, bpy.context)
     counts[f"{budget} {refine} {size}"] = [e.gaussians, e.reconstructing]
-settings.learn_number("guided", 9000, 10_000)
+estimates.learn_number("guided", 9000, 10_000)
 chosen.budget, chosen.refine, chosen.size = "ALL", 0, 128
-counts["learnt"] = settings.estimate(chosen, bpy.context).gaussians
+counts["learnt"] = estimates.estimate(chosen, bpy.context).gaussians
 tell(counts=counts, ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
-     estimates=estimates)
+     estimates=pictures)
 """
 
 

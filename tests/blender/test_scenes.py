@@ -332,7 +332,7 @@ for how in ("layer.exclude = True", "layer.hide_viewport = True", "c.objects[0].
     scene(f"a rig with {how.split()[0]}", at(0, -1, 0, 0), at(0, 1, 0, 0), sides=-1, code=f"""
 box()
 bpy.ops.timesplat.add_cameras(rig="ROTATING", distance=4)
-c = bpy.data.collections[settings.RIG]
+c = bpy.data.collections[settings.RIG_COLLECTION]
 layer = bpy.context.view_layer.layer_collection.children[c.name]
 {how}
 bpy.ops.object.select_all(action="DESELECT")
