@@ -10,7 +10,7 @@ import pytest
 from timesplat.model import formats
 from timesplat.model.asset import ARRAYS, VISIBLE, read_ply, rotation_matrices, write_ply
 
-from .helpers import CLIP, make
+from ..helpers import CLIP, make
 
 EXPORT = """
 import atexit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The point cloud and its nodes against numpy; splats against a small ray tracer."""
+"""The point cloud and its nodes against numpy."""
 
 import json
 import math
@@ -9,32 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from timesplat.datagen.rigs import spherical
-from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
-from timesplat.model.asset import SH_C0, linear_from_srgb, read_ply, rotation_matrices, write_ply
+from timesplat.model.asset import SH_C0, linear_from_srgb, read_ply, write_ply
 
-from .helpers import make
+from ..helpers import make
+from .evaluated import READ, expected_time
 
-READ = """
-def shown(ob, *names):
-    \"\"\"Attributes of the evaluated point cloud at the scene's frame, as lists; {} where it is empty.\"\"\"
-    graph = bpy.context.evaluated_depsgraph_get()
-    for i in graph.object_instances:  # a mesh that stands in for a point cloud has it as an instance
-        if i.object.type == "POINTCLOUD" and (i.object.original == ob or i.parent and i.parent.original == ob):
-            data, out = i.object.data, {}
-            names = names if len(data.points) else ()
-            for name in names:
-                attribute = data.attributes[name]
-                key, width = {"FLOAT": ("value", 1), "FLOAT_VECTOR": ("vector", 3), "FLOAT_COLOR": ("color", 4),
-                              "QUATERNION": ("value", 4)}[attribute.data_type]
-                a = np.empty(len(data.points) * width, np.float32)
-                attribute.data.foreach_get(key, a)
-                out[name] = (a.reshape(-1, width) if width > 1 else a).tolist()
-            out["world"] = [list(i.matrix_world @ p.co) for p in data.points][:5]
-            out["material"] = data.materials[0].name if len(data.materials) and data.materials[0] else ""
-            return out
-    return {}
-"""
 EVALUATE = """
 display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
 asset = part("model.asset").read_ply(sys.argv[1])
@@ -117,22 +96,6 @@ CHOSEN = [
 FRAMES = (-40.75, 10.0, 21.5, 33.0, 34.5, 57.25, 101.0)
 
 
-def expected_time(s, frame):
-    """The model time that the documentation promises, written another way than in nodes.py and apply_sliders.py."""
-    start, end = s["Frame Start"], s["Frame End"]
-    moved = start + (frame - start - s["Time Offset"]) * s["Time Scale"]
-    if start == end:
-        return 0.0
-    if s["Repeat"] == "Loop":  # shown once a round: every frame of the clip
-        while moved < start:
-            moved += end - start + 1
-        while moved >= end + 1:
-            moved -= end - start + 1
-    while s["Repeat"] == "Ping-Pong" and not start <= moved <= end:
-        moved = 2 * (start if moved < start else end) - moved
-    return 2 * (min(max(moved, start), end) - start) / (end - start) - 1
-
-
 def test_every_slider_does_what_numpy_says(blender, tmp_path):
     asset = make(200)
     write_ply(tmp_path / "a.ply", asset)
@@ -187,60 +150,6 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
         np.testing.assert_allclose(told["out"][frame]["position"], position[opacity >= 0.05], atol=1e-4)
 
 
-PANEL = """
-import types
-display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
-result_panel = part("addon.ui.result_panel")
-bpy.ops.wm.read_factory_settings(use_empty=True)
-ob = display.add_asset(part("model.asset").read_ply(sys.argv[1]), "a")
-drawn, buttons, labels = {}, [], []
-class Layout:
-    def row(self, **_): return self
-    column = row
-    def label(self, text="", **_): labels.append(text)
-    def operator(self, name, **_): return buttons.append(name) or types.SimpleNamespace()
-    def operator_menu_enum(self, name, key, **_): buttons.append(name)
-    def prop(self, owner, key, text=""):
-        if key == "value":
-            owner.bl_rna.properties[key]
-        else:
-            owner.path_resolve(key)
-        drawn[text] = key
-panel = types.SimpleNamespace(layout=Layout())
-scene = bpy.context.scene
-sliders.set_input(sliders.asset_modifier(ob), "Crop", True)
-for transform in ("AgX", "Standard"):
-    scene.view_settings.view_transform = transform
-    buttons.clear()
-    result_panel.TIMESPLAT_PT_result.draw(panel, bpy.context)
-    if transform == "AgX":
-        warned = list(buttons)
-all_drawn = list(drawn)
-drawn.clear()
-sliders.set_input(sliders.asset_modifier(ob), "Crop", False)
-result_panel.TIMESPLAT_PT_result.draw(panel, bpy.context)
-scene.view_settings.view_transform = "AgX"
-part("addon").register()
-bpy.ops.timesplat.set_standard()
-poll = [result_panel.TIMESPLAT_PT_result.poll(bpy.context)]
-bpy.ops.object.delete()
-poll.append(result_panel.TIMESPLAT_PT_result.poll(bpy.context))
-tell(drawn=all_drawn, uncropped=list(drawn), sliders=list(sliders.SLIDERS), warned=warned, buttons=buttons,
-     labels=labels, poll=poll, transform=scene.view_settings.view_transform)
-part("addon").unregister()
-"""
-
-
-def test_the_panel_shows_the_modifiers_own_sliders(blender, tmp_path):
-    write_ply(tmp_path / "a.ply", make(1234))
-    told = blender(PANEL, tmp_path / "a.ply")
-    assert told["drawn"] == told["sliders"] and told["labels"][0] == "1,234 Gaussians"
-    assert told["uncropped"] == [x for x in told["sliders"] if x not in ("Crop Min", "Crop Max")]
-    assert "timesplat.set_standard" in told["warned"] and "timesplat.set_standard" not in told["buttons"]
-    assert {"timesplat.compare", "timesplat.bake", "timesplat.delete"} <= set(told["buttons"])
-    assert told["transform"] == "Standard" and told["poll"] == [True, False]
-
-
 NATIVE = """
 display, nodes, sliders = (part(f"addon.asset.{x}") for x in ("display", "nodes", "sliders"))
 asset = part("model.asset").read_ply(sys.argv[1])
@@ -274,109 +183,6 @@ def test_blenders_own_splats_get_the_attributes_that_they_are_known_by(blender, 
     np.testing.assert_allclose(got["rotation"], asset.rotation[seen], atol=1e-6)
     base = np.concatenate([(asset.rgb - 0.5) / SH_C0, opacity[:, None]], 1)[seen]
     np.testing.assert_allclose(got["radiance:base"], base, atol=1e-5)
-
-
-FOLLOW = """
-display, parenting = part("addon.asset.display"), part("addon.asset.parenting")
-asset = part("model.asset").read_ply(sys.argv[1])
-bpy.ops.wm.read_factory_settings(use_empty=True)
-scene, told = bpy.context.scene, {}
-def made(name, parent=None):
-    ob = bpy.data.objects.new(name, bpy.data.meshes.new(name))
-    scene.collection.objects.link(ob)
-    ob.parent = parent
-    return ob
-original, above = made("original"), made("above")
-original.parent, original.location, original.scale = above, (1, 2, 3), (2,) * 3
-above.location, above.rotation_euler = (0, 0, 5), (0.3, 0.2, 0.1)
-ob = display.add_asset(asset, "a", look="Points")
-before = shown(ob, "position")["world"]
-told["did"] = parenting.follow(ob, original)
-scene.frame_set(20)
-scene.frame_set(1)
-told["stays"] = np.abs(np.array(before) - shown(ob, "position")["world"]).max().item()
-original.location.x += 10
-bpy.context.view_layer.update()
-told["axis"] = [10 * x for x in above.matrix_world.col[0][:3]]
-told["moves"] = (np.array(shown(ob, "position")["world"]) - before).mean(0).tolist()
-keyed, held, child, bone = made("keyed"), made("held"), made("child"), made("bone")
-keyed.keyframe_insert("rotation_euler", frame=1)
-held.constraints.new("COPY_LOCATION")
-child.parent = keyed
-driven, shape = made("driven"), made("shape")
-driven.driver_add("location", 0)
-shape.keyframe_insert("hide_render", frame=1)
-told["refused"] = [parenting.follow(ob, x) for x in (keyed, held, child, driven, ob)]
-told["shape"] = parenting.follow(ob, shape)
-tell(**told)
-"""
-
-
-def test_it_follows_an_original_that_stands_still_by_itself(blender, tmp_path):
-    write_ply(tmp_path / "a.ply", make())
-    told = blender(READ + FOLLOW, tmp_path / "a.ply")
-    assert told["did"] and told["shape"] and told["refused"] == [False] * 5
-    assert told["stays"] < 1e-5 and told["moves"] == pytest.approx(told["axis"], abs=1e-4)
-
-
-RENDER = """
-from timesplat.addon.asset import blend_file, sliders
-blend_file.save_blend(sys.argv[1], sys.argv[2])
-bpy.ops.wm.open_mainfile(filepath=sys.argv[2])
-scene = bpy.context.scene
-ob = next(o for o in bpy.data.objects if o.get("timesplat"))
-sliders.set_input(ob.modifiers[0], "Look", "Splats")
-scene.render.resolution_x = scene.render.resolution_y = 48
-scene.cycles.samples, scene.cycles.filter_width, scene.cycles.use_adaptive_sampling = 32, 0.01, False
-scene.render.film_transparent = True
-scene.frame_set(21, subframe=0.5)
-image = scene.render.image_settings
-image.file_format, image.color_depth = "OPEN_EXR", "32"
-scene.render.filepath = sys.argv[3]
-bpy.ops.render.render(write_still=True)
-tell(range=[scene.frame_start, scene.frame_end], fps=scene.render.fps / scene.render.fps_base,
-     transform=scene.view_settings.view_transform)
-"""
-
-
-def test_splats_are_rendered_as_the_formula_says(blender, tmp_path):
-    """Against a ray tracer of a few lines: linear light, front to back, α exp(-½ d²) along each ray."""
-    OpenEXR = pytest.importorskip("OpenEXR")
-    asset = make(60, seed=3)
-    asset.sigma_t[:] = 1.0
-    asset.scale[:] = np.exp(np.random.default_rng(1).uniform(-4, -1.6, asset.scale.shape))
-    write_ply(tmp_path / "a.ply", asset)
-    told = blender(RENDER, tmp_path / "a.ply", tmp_path / "a.blend", tmp_path / "a.exr")
-    assert told["range"] == [10, 33] and abs(told["fps"] - 23.976) < 1e-4 and told["transform"] == "Standard"
-    with OpenEXR.File(str(tmp_path / "a.exr")) as f:
-        got = f.channels()["RGBA"].pixels
-
-    size, c2w = 48, opengl_to_opencv(spherical(0, 0))
-    position, alpha = (x.astype(float) for x in asset.at(asset.frame_to_time(21.5)))
-    y, x = np.mgrid[:size, :size] + 0.5
-    f = focal_from_fov(50, size)
-    ray = np.stack([(x - size / 2) / f, (y - size / 2) / f, np.ones_like(x)], -1) @ c2w[:3, :3].T
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    scale = asset.soft_scale()
-    reach = 3 * scale.max(1)
-    offset = c2w[:3, 3] - position  # (N,3)
-    M = (rotation_matrices(asset.rotation) / scale[:, None]).transpose(0, 2, 1)
-    w = np.einsum("nij,yxj->nyxi", M, ray)
-    u = np.einsum("nij,nj->ni", M, offset)[:, None, None]
-    d2 = (np.cross(u, w) ** 2).sum(-1) / (w**2).sum(-1)
-    b = np.einsum("ni,yxi->nyx", offset, ray)
-    disc = b**2 - ((offset**2).sum(-1) - reach**2)[:, None, None]  # spheres are met at their front
-    entry = np.where(disc > 0, -b - np.sqrt(np.maximum(disc, 0)), np.inf)
-    a = np.where((disc > 0) & (alpha >= 0.05)[:, None, None], alpha[:, None, None] * np.exp(-0.5 * d2), 0)
-    order = np.argsort(entry, 0)
-    a = np.take_along_axis(a, order, 0)
-    colour = linear_from_srgb(asset.rgb)[order]  # (N,H,W,3)
-    through = np.cumprod(1 - a, 0)
-    weight = a * np.concatenate([np.ones((1, size, size)), through[:-1]])
-    expected = np.concatenate([(weight[..., None] * colour).sum(0), (1 - through[-1])[..., None]], -1)
-    assert expected[..., 3].mean() > 0.15
-    error = np.abs(got - expected)
-    assert error.mean() < 2e-4 and error.max() < 0.03, (error.mean(), error.max())
 
 
 def test_the_clip_is_placed_on_fractional_rates(blender):

@@ -10,8 +10,8 @@ import pytest
 
 from timesplat.model.asset import ARRAYS, Asset, Clip, read_ply, write_ply
 
-from .helpers import make
-from .test_display import expected_time
+from ..helpers import make
+from .evaluated import expected_time
 
 START = """
 part("addon").register()

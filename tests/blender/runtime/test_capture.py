@@ -14,7 +14,7 @@ import pytest
 
 from timesplat.datagen.sequence import read_sequence
 
-from .helpers import CHECKOUT, Runner
+from ..helpers import CHECKOUT, Runner
 
 SETUP = """
 import traceback

@@ -11,7 +11,7 @@ import pytest
 from timesplat.model import slices
 from timesplat.model.asset import ARRAYS, VISIBLE, read_ply, write_ply
 
-from .helpers import make
+from ..helpers import make
 
 IMPORT = """
 import atexit
