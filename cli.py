@@ -273,7 +273,7 @@ def save_blend(asset: Path, out: Path) -> None:
     """The asset as a .blend that plays without the add-on; Blender runs in a process of its own."""
     import subprocess
 
-    command = [sys.executable, "-m", "timesplat.addon.display", str(asset), str(out)]
+    command = [sys.executable, "-m", "timesplat.addon.asset.blend_file", str(asset), str(out)]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
     if done.returncode:
         reason = (done.stderr.strip() or done.stdout.strip() or "Blender stopped").splitlines()[-1]

@@ -5,8 +5,10 @@ from importlib import import_module
 
 # In the order in which they are registered; what comes later may use what comes before.
 MODULES = (
-    *("preferences", "settings", "importer", "jobs", "setup", "rigs", "beside", "reconstruct", "commands"),
-    *("panel", "display", "edit", "compare", "exporter"),
+    *("ui.preferences", "settings", "operators.import_asset", "runtime.jobs", "operators.job_operators"),
+    *("operators.runtime_buttons", "operators.add_cameras", "runtime.background_blender", "operators.reconstruct"),
+    *("command_line", "operators.presets", "ui.panel", "operators.view_colours", "operators.delete", "operators.bake"),
+    *("ui.result_panel", "operators.compare", "operators.export_asset"),
 )
 
 

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panel and the Reconstruct operator have in common: their settings, what these select in the scene, and
-how long it will take."""
+"""What the panel and the Reconstruct operator have in common: their settings, and what these select in the scene."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..datagen.scene.borrow import shown_objects
 from ..datagen.sequence import InputError
-from . import display
+from .asset.sliders import LOOKS
 
-RIG = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
-AIM = 24  # frames that "every: automatic" comes near to
-SHAPES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD")
+RIG_COLLECTION = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
+MOST_AUTOMATIC_FRAMES = 24  # frames that "every: automatic" comes near to
+CAPTURED_TYPES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD")
 METHODS = [
     ("guided", "Guided", "The network, led by depth and motion that Blender renders along"),
     ("lift", "Lift", "Depth and motion straight to Gaussians, without a network: fastest"),
@@ -54,7 +51,7 @@ class Settings:
     frame_end: IntProperty(name="End", default=24)
     every: IntProperty(
         name="Every n-th",
-        description=f"Capture every n-th frame; 0: so many that there are at most {AIM}",
+        description=f"Capture every n-th frame; 0: so many that there are at most {MOST_AUTOMATIC_FRAMES}",
         min=0,
         max=1000,
     )
@@ -80,7 +77,7 @@ class Settings:
         name="Share", description="Of the Gaussians predicted", default=10, min=0.1, max=100, subtype="PERCENTAGE"
     )
     number: IntProperty(name="Number", description="Most Gaussians", default=4000, min=1, max=10_000_000)
-    look: EnumProperty(name="Look", items=[(x, x, "") for x in display.LOOKS], default=display.LOOKS[0])
+    look: EnumProperty(name="Look", items=[(x, x, "") for x in LOOKS], default=LOOKS[0])
     output: StringProperty(name="Save As", description="Also keep the asset as this .ply", subtype="FILE_PATH")
 
 
@@ -107,7 +104,7 @@ def frames(settings, scene) -> range:
     first, last = (settings.frame_start, settings.frame_end) if own else (scene.frame_start, scene.frame_end)
     if last < first:
         raise InputError(f"Frames {first} to {last}: the range is empty; let it end after its start.")
-    return range(first, last + 1, settings.every) if settings.every else spread(first, last, AIM)
+    return range(first, last + 1, settings.every) if settings.every else spread(first, last, MOST_AUTOMATIC_FRAMES)
 
 
 def objects(settings, context) -> list:
@@ -124,7 +121,7 @@ def objects(settings, context) -> list:
             raise InputError(f"{settings.collection or 'Collection'}: no such collection; choose one.")
         inside = set(collection.all_objects)
         shown = [o for o in shown if o in inside or o.type == "LIGHT"]
-    if not any(o.type in SHAPES or o.instance_type == "COLLECTION" for o in shown):
+    if not any(o.type in CAPTURED_TYPES or o.instance_type == "COLLECTION" for o in shown):
         raise InputError("There is nothing to capture: no mesh is chosen that renders show; choose another Object.")
     return shown
 
@@ -135,7 +132,7 @@ def cameras(context) -> tuple[list, str]:
     selected = [o for o in context.view_layer.objects.selected if o.type == "CAMERA"]
     if selected:
         return selected, f"{len(selected)} selected camera{'s' * (len(selected) > 1)}"
-    rig = bpy.data.collections.get(RIG)
+    rig = bpy.data.collections.get(RIG_COLLECTION)
     placed = [o for o in rig.objects if o.type == "CAMERA" and o.name in context.scene.objects] if rig else []
     if placed:
         return placed, f"{len(placed)} camera{'s' * (len(placed) > 1)} of the rig"
@@ -147,53 +144,6 @@ def budget(settings) -> str | None:
     return {"ALL": None, "SHARE": f"{settings.share:g}%", "NUMBER": str(settings.number), "AUTO": "auto"}[
         settings.budget
     ]
-
-
-# ---------------------------------------------------------------- how long it takes
-
-# Gaussians a pixel of the pictures: the mean of 12 objects, until one was made here
-_fill = {"guided": 0.19, "lift": 0.19, "rgb": 0.11}
-START, FITTING = 3.0, 5.0  # seconds: a process's start; a budget's own fit of pictures of PIXELS
-PIXELS = 128**2
-FITTED = 4000  # Gaussians that a fit of pictures of PIXELS uses at most, and in proportion to their sides
-PIXEL = {"guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
-_rate = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
-
-
-@dataclass
-class Estimate:
-    """What a reconstruction comes to, roughly; times in seconds."""
-
-    pictures: int
-    rendering: float
-    reconstructing: float
-    gaussians: int
-
-
-def estimate(settings, context) -> Estimate:
-    """Nothing is evaluated or read for it. Raises InputError for an empty range of frames."""
-    n = len(frames(settings, context.scene))
-    placed, _ = cameras(context)
-    n *= 1 if settings.in_turn or not placed else len(placed)
-    pixels = n * settings.size**2
-    predicted = _fill[settings.method] * pixels
-    fit = settings.refine or (FITTING * max(settings.size**2 / PIXELS, 1) if settings.budget != "ALL" else 0)
-    most = FITTED * settings.size / PIXELS**0.5 if fit else predicted
-    kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
-    count = min(kept, most, predicted)
-    reconstructing = START + pixels * PIXEL[settings.method] + fit * (3 if settings.budget == "AUTO" else 1)
-    return Estimate(n, START + pixels * settings.samples * _rate, reconstructing, round(count))
-
-
-def learn(seconds: float, pixels: int, samples: int) -> None:
-    """Remembers, for this session, how fast this machine captures."""
-    global _rate
-    _rate = max(seconds - START, 0.1) / max(pixels * samples, 1)
-
-
-def learn_number(method: str, gaussians: int, pixels: int) -> None:
-    """Remembers, for this session, how many Gaussians were predicted from so many pixels."""
-    _fill[method] = gaussians / max(pixels, 1)
 
 
 def register() -> None:

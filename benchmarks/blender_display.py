@@ -61,11 +61,11 @@ def median(act) -> float:
 
 
 def frame_changes(ob) -> list[tuple[str, float]]:
-    from timesplat.addon import display
+    from timesplat.addon.asset.sliders import asset_modifier, set_input
 
     scene, rows = bpy.context.scene, []
     for look in ("Points", "Splats"):
-        display.set_input(display.sampler(ob), "Look", look)
+        set_input(asset_modifier(ob), "Look", look)
         for name, step in (("whole frames", 1.0), ("fractional frames", 0.37)):
 
             def change(i, step=step):
@@ -73,7 +73,7 @@ def frame_changes(ob) -> list[tuple[str, float]]:
                 scene.frame_set(int(frame), subframe=frame % 1)
 
             rows.append((f"frame change, {look}, {name}", median(change)))
-    display.set_input(display.sampler(ob), "Look", "Points")
+    set_input(asset_modifier(ob), "Look", "Points")
     return rows
 
 
@@ -122,7 +122,8 @@ def windowed():
 
 def made():
     """The asset's object, beside whatever the start-up scene holds, with the add-on registered."""
-    from timesplat.addon import display, register
+    from timesplat.addon import register
+    from timesplat.addon.asset import display
 
     register()
     return display.add_asset(asset(), "benchmark", look="Points")

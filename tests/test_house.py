@@ -43,8 +43,8 @@ def rooms(name: str) -> set[str]:
 
 
 def test_the_walker_sees_what_it_should():
-    assert "model.io.asset" in rooms("addon/display.py") and "datagen.rigs" in rooms("addon/rigs.py")
-    assert "addon.display" in rooms("addon/reconstruct.py") and "torch" in imports("model/gaussians.py")
+    assert "model.io.asset" in rooms("addon/asset/display.py") and "torch" in imports("model/gaussians.py")
+    assert {"addon.asset.display", "addon.settings", "datagen.sequence"} <= rooms("addon/operators/reconstruct.py")
     assert "model.reconstruct" in rooms("model/worker.py")  # inside a function
 
 
@@ -64,6 +64,31 @@ def test_floors(name):
     if floor != "addon" and name != "__init__.py":
         told -= {"addon.package"} if name == "cli.py" else set()  # builds the .zip, without bpy
         assert not any(r.split(".")[0] == "addon" for r in told), "nobody imports the add-on"
+
+
+ADDON = [n for n in NAMES if n.startswith("addon/")]
+# Storeys of the top floor, lowest first: each may use those below it, and its own rooms where that closes no circle.
+STOREYS = ("asset", "runtime", "settings", "estimates", "operators", "ui")
+ATTIC = ("", "command_line")  # `addon` itself, which registers all of them, and the command line
+
+
+@pytest.mark.parametrize("name", ADDON)
+def test_storeys_of_the_addon(name):
+    def storey(room: str) -> int:
+        first = room.split(".")[1] if "." in room else ""
+        return len(STOREYS) if first in ATTIC else STOREYS.index(first)
+
+    room = name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    if room != "addon.package":  # it runs without Blender, and nobody needs it there
+        assert all(storey(r) <= storey(room) for r in rooms(name) if r.startswith("addon"))
+
+
+def test_no_circle_in_the_addon():
+    """Imports inside functions included."""
+    left = {n.removesuffix(".py").removesuffix("/__init__").replace("/", "."): rooms(n) - {"addon"} for n in ADDON}
+    while free := [room for room, needs in left.items() if not needs & left.keys()]:
+        left = {room: needs for room, needs in left.items() if room not in free}
+    assert left == {}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from timesplat.addon import package, process, runtime
+from timesplat.addon import package
+from timesplat.addon.runtime import child_process as process
+from timesplat.addon.runtime import install as runtime
 from timesplat.datagen import render_asset, sequence
 from timesplat.datagen.farm import render_assets
 from timesplat.datagen.render_job import RenderSettings
@@ -228,7 +230,7 @@ def test_codes_of_windows_are_said_as_one_looks_them_up(tmp_path):
     c = process.Child([sys.executable, "-c", ""], {}, tmp_path)
     assert c.poll(60)[0]["message"] == "The process ended with code 0: it said nothing"
     c.process.returncode = 0xC0000005
-    assert c._last_words() == "The process ended with code 0xc0000005: it said nothing"
+    assert c._why_it_ended() == "The process ended with code 0xc0000005: it said nothing"
 
 
 def test_what_the_worker_starts_does_not_wait_for_its_input():
@@ -257,7 +259,7 @@ def test_the_installer_gives_its_input_to_nobody(tmp_path, monkeypatch):
         "run",
         lambda command, **more: given.append(more) or subprocess.CompletedProcess(command, 0, "{}", ""),
     )
-    runtime._make_venv(tmp_path / "venv"), runtime._has_index(["pip"]), runtime._prove(tmp_path / "python")
+    runtime._make_venv(tmp_path / "venv"), runtime._has_index(["pip"]), runtime._import_all(tmp_path / "python")
     assert len(given) >= 3
     assert all((m["stdin"], m["encoding"], m["errors"]) == (subprocess.DEVNULL, "utf-8", "replace") for m in given)
 
@@ -288,8 +290,8 @@ def test_only_linux_limits_the_address_space(monkeypatch):
 def test_where_torch_comes_from(tmp_path, monkeypatch, platform, build, indices):
     asked = []
     monkeypatch.setattr(runtime, "_make_venv", lambda folder: folder.mkdir() or ["pip"])
-    monkeypatch.setattr(runtime, "_install", lambda command, *rest: asked.append(command))
-    monkeypatch.setattr(runtime, "_prove", lambda python: {})
+    monkeypatch.setattr(runtime, "_pip_install", lambda command, *rest: asked.append(command))
+    monkeypatch.setattr(runtime, "_import_all", lambda python: {})
     monkeypatch.setattr(runtime, "_has_index", lambda pip: False)
     monkeypatch.setattr(sys, "platform", platform)
     (tmp_path / "w").mkdir()
@@ -308,22 +310,24 @@ def test_where_torch_comes_from(tmp_path, monkeypatch, platform, build, indices)
     ],
 )  # fmt: skip
 def test_what_pip_says_on_windows(tmp_path, line, words):
-    why = runtime._why(line.split("\n"), tmp_path)
+    why = runtime._explain(line.split("\n"), tmp_path)
     assert words in why and "\n" not in why
 
 
 def test_torch_lacks_a_library_of_microsofts(monkeypatch, tmp_path):
     said = 'importing torch\nOSError: [WinError 126] The specified module could not be found. Error loading "c10.dll"'
-    monkeypatch.setattr(runtime, "_said", lambda command: subprocess.CompletedProcess(command, 1, "", said))
-    with pytest.raises(runtime.Stop, match=r"^torch was installed but does not start.*Visual C\+\+ Redistributable"):
-        runtime._prove(tmp_path / "python")
+    monkeypatch.setattr(runtime, "_run", lambda command: subprocess.CompletedProcess(command, 1, "", said))
+    with pytest.raises(
+        runtime.InstallError, match=r"^torch was installed but does not start.*Visual C\+\+ Redistributable"
+    ):
+        runtime._import_all(tmp_path / "python")
 
 
 def test_a_blender_that_macos_runs_from_elsewhere_gets_no_runtime(monkeypatch, tmp_path):
     """It would be gone with that place."""
     place = "/private/var/folders/zz/T/AppTranslocation/0A/d/Blender.app/Contents/Resources/5.2/python/bin/python3.13"
     monkeypatch.setattr(sys, "executable", place)
-    with pytest.raises(runtime.Stop, match="move it into the folder Applications"):
+    with pytest.raises(runtime.InstallError, match="move it into the folder Applications"):
         runtime._make_venv(tmp_path / "venv")
 
 

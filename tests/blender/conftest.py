@@ -10,6 +10,7 @@ import sys
 import pytest
 
 from .helpers import CHECKOUT, ENABLED, REAL, TARGET, Runner
+from .packages import runtime, wheel
 
 WORKER = {"TIMESPLAT_PYTHON": sys.executable}  # has torch, where Blender has none
 
@@ -56,3 +57,13 @@ def installed(profile, tmp_path):
     runner = Runner(tmp_path / "installed", ENABLED, WORKER)
     shutil.copytree(profile, runner.user)
     return runner
+
+
+@pytest.fixture
+def index(tmp_path):
+    """A folder of all packages that the runtime needs, each newer than it must be."""
+    folder = tmp_path / "wheels"
+    folder.mkdir()
+    for name, version, _ in runtime.REQUIREMENTS:
+        wheel(folder, name, f"{version}.7")
+    return folder

@@ -66,8 +66,8 @@ class Runner:
     """`run(code, *args, env=None)` runs `code` in a new Blender and gives the dict that it hands to `tell(**)`.
 
     The code finds `bpy`, `np`, `json`, `os`, `sys`, its arguments as strings from sys.argv[1] on, and the package
-    under the name `name`: `part("addon.display")` imports a room of it. The folders `user` (the profile) and `tmp`
-    stay from run to run of a test."""
+    under the name `name`: `part("addon.asset.display")` imports a room of it. The folders `user` (the profile) and
+    `tmp` stay from run to run of a test."""
 
     def __init__(self, folder: Path, head: str, env: dict | None = None) -> None:
         self.folder, self.head, self.env = folder, head, env or {}

@@ -14,23 +14,15 @@ from .helpers import REAL, ROOT, TARGET, make
 
 ALLOWED = [
     *("__init__.py", "LICENSE", "README.md", "blender_manifest.toml"),
-    *(
-        "addon/*.py",
-        "datagen/*.py",
-        "datagen/*/*.py",
-        "model/*.py",
-        "model/fitting/*.py",
-        "model/geometry/*.py",
-        "model/io/*.py",
-    ),
-    *("model/rasterize/*.py",),
+    *("addon/*.py", "addon/*/*.py", "datagen/*.py", "datagen/*/*.py", "model/*.py"),
+    *("model/fitting/*.py", "model/geometry/*.py", "model/io/*.py", "model/rasterize/*.py"),
     *("model/checkpoints/*.safetensors", "model/checkpoints/*.md"),
 ]
 NEEDED = {
     "__init__.py",
     "LICENSE",
     "blender_manifest.toml",
-    "addon/display.py",
+    "addon/asset/display.py",
     "datagen/capture.py",
     "model/worker.py",
 }
@@ -95,7 +87,7 @@ import time
 def use():
     done = bpy.ops.timesplat.import_asset(filepath=sys.argv[1], use_clip=True, look="Splats")
     ob = bpy.context.object
-    said = dict(done=list(done), count=part("addon.edit").asset_of(ob).xyz.shape[0], scale=list(ob.scale),
+    said = dict(done=list(done), count=part("addon.asset.asset_object").asset_of(ob).xyz.shape[0], scale=list(ob.scale),
                 at=list(ob.location), range=[bpy.context.scene.frame_start, bpy.context.scene.frame_end],
                 fps=bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
     bpy.ops.timesplat.export_asset(filepath=sys.argv[3])
@@ -110,7 +102,7 @@ folder = os.path.dirname(sys.modules[name].__file__)
 result["strange"] = [[m, f] for m, f in ((m, getattr(x, "__file__", None) or "") for m, x in list(sys.modules.items()))
     if (f.startswith(folder) and m != name and not m.startswith(name + ".")) or m.split(".")[0] == "timesplat"]
 result["heavy"] = sorted({m.split(".")[0] for m in sys.modules} & {"torch", "numba", "PIL", "triton", "safetensors"})
-timers = [part("addon.jobs")._look]
+timers = [part("addon.runtime.jobs")._poll_jobs]
 on, off = [], []
 for _ in range(2):
     on.append(traces())
@@ -119,7 +111,7 @@ for _ in range(2):
     result["timers"] = any(bpy.app.timers.is_registered(t) for t in timers)
     bpy.ops.preferences.addon_enable(module=name)
     use()
-    timers.append(part("addon.jobs")._look)
+    timers.append(part("addon.runtime.jobs")._poll_jobs)
 tell(**result, on=on, off=off, runs=os.listdir(bpy.utils.extension_path_user(name, path="runs", create=True)))
 """
 

@@ -49,7 +49,7 @@ chosen.size, chosen.samples, chosen.method, chosen.budget, chosen.refine = 64, 8
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
 tell()
 """
-JOBS = "[(j.state, j.fraction, j.text, j.message) for j in ours('addon.jobs').JOBS]"
+JOBS = "[(j.state, j.fraction, j.text, j.message) for j in ours('addon.runtime.jobs').JOBS]"
 STATE = "[(s.name, s.frame_current, s.render.resolution_x, s.camera) for s in bpy.data.scenes], len(bpy.data.cameras)"
 ENDED = f"[s for s, *_ in {JOBS} if s not in ('running', 'waiting')]"
 
@@ -104,7 +104,7 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         side = w.sidebar()
         w.find("preferences.addon_show", side["x"] + 0.75 * (side["w"] - 28), 100, 300)  # until there is a runtime
         w.preferences(sys.executable)
-        assert w.ask("ours('addon.preferences').get().python") == sys.executable
+        assert w.ask("ours('addon.runtime.worker_options').addon_preferences().python") == sys.executable
 
         w.sidebar()
         w.press("preset='DRAFT'", across=0.15)
@@ -114,7 +114,7 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         w.picture("settings")
         before = w.ask(STATE)
         w.press("timesplat.reconstruct")
-        w.wait_for(f"{JOBS}[-1][1] > 0.1 and len(ours('addon.jobs').running()) == 1", 120)
+        w.wait_for(f"{JOBS}[-1][1] > 0.1 and len(ours('addon.runtime.jobs').running()) == 1", 120)
         w.picture("running")
         w.wait_for(ENDED, 300)
         assert w.ask(JOBS)[-1][0] == "done", w.ask(JOBS)
@@ -202,7 +202,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
             w.key(*keys)
 
         def alone() -> None:
-            w.wait_for("not ours('addon.jobs').running()")
+            w.wait_for("not ours('addon.runtime.jobs').running()")
             time.sleep(0.5)
             assert len(processes(w.tmp)) == 1, processes(w.tmp)  # Blender
             assert list(Path(w.env["BLENDER_USER_RESOURCES"]).rglob("runs/*")) == []

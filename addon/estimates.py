@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How long a reconstruction will take and how many Gaussians it will have, before it starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .settings import cameras, frames
+
+# Gaussians a pixel of the pictures: the mean of 12 objects, until one was made here
+_gaussians_a_pixel = {"guided": 0.19, "lift": 0.19, "rgb": 0.11}
+START_SECONDS = 3.0  # of a process
+FIT_SECONDS = 5.0  # of a budget's own fit, of pictures of USUAL_PIXELS
+USUAL_PIXELS = 128**2  # of a picture
+USUAL_GAUSSIANS = 4000  # that a fit of pictures of USUAL_PIXELS uses at most, and in proportion to their sides
+SECONDS_A_PIXEL = {"guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
+_seconds_a_sample = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
+
+
+@dataclass
+class Estimate:
+    """What a reconstruction comes to, roughly; times in seconds."""
+
+    pictures: int
+    rendering: float
+    reconstructing: float
+    gaussians: int
+
+
+def estimate(settings, context) -> Estimate:
+    """Nothing is evaluated or read for it. Raises InputError for an empty range of frames."""
+    n = len(frames(settings, context.scene))
+    placed, _ = cameras(context)
+    n *= 1 if settings.in_turn or not placed else len(placed)
+    pixels = n * settings.size**2
+    predicted = _gaussians_a_pixel[settings.method] * pixels
+    fit = settings.refine or (FIT_SECONDS * max(settings.size**2 / USUAL_PIXELS, 1) if settings.budget != "ALL" else 0)
+    most = USUAL_GAUSSIANS * settings.size / USUAL_PIXELS**0.5 if fit else predicted
+    kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
+    count = min(kept, most, predicted)
+    fits = 3 if settings.budget == "AUTO" else 1
+    rendering = START_SECONDS + pixels * settings.samples * _seconds_a_sample
+    reconstructing = START_SECONDS + pixels * SECONDS_A_PIXEL[settings.method] + fit * fits
+    return Estimate(n, rendering, reconstructing, round(count))
+
+
+def learn_speed(seconds: float, pixels: int, samples: int) -> None:
+    """Remembers, for this session, how fast this machine captures."""
+    global _seconds_a_sample
+    _seconds_a_sample = max(seconds - START_SECONDS, 0.1) / max(pixels * samples, 1)
+
+
+def learn_number(method: str, gaussians: int, pixels: int) -> None:
+    """Remembers, for this session, how many Gaussians were predicted from so many pixels."""
+    _gaussians_a_pixel[method] = gaussians / max(pixels, 1)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Renders the pictures, in a background Blender (`background_blender`). The request:
+objects    full names of what is captured       cameras    full names of cameras, or [] for those of `rig`
+rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
+frames     scene frames                         in_turn    one camera a frame, instead of all of them
+size, samples, passes, lighting                 as `datagen.render_setup.CaptureSettings` has them
+sequence   folder to write
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...datagen import rigs
+from ...datagen.capture import Subject, capture
+from ...datagen.render_setup import CaptureSettings
+from ...datagen.scene.measure import normalisation
+from ...datagen.scene.open import tool_versions
+from ...datagen.scene.simulate import simulate
+from ...datagen.sequence import InputError, Normalisation
+from . import background_blender, child_process
+
+
+def start_capture(request: dict, folder: Path) -> child_process.Child:
+    """Starts the capture of the open scene. Raises InputError."""
+    return background_blender.start("addon.runtime.capture", request, folder)
+
+
+def camera_shots(scene, cameras: list, frames: list[int], norm: Normalisation, in_turn: bool) -> list[rigs.Shot]:
+    """What the scene's own cameras see at each frame (or one of them in turn), in normalised space: perspective,
+    square. What is hidden in the viewport or in an excluded collection is not evaluated: it is linked and shown."""
+    for ob in cameras:
+        if scene.collection not in ob.users_collection:
+            scene.collection.objects.link(ob)
+        ob.hide_viewport = False
+        ob.hide_set(False)
+    shots = []
+    for i, frame in enumerate(frames):
+        scene.frame_set(frame)
+        for ob in [cameras[i % len(cameras)]] if in_turn else cameras:
+            fov, shift = float(np.degrees(ob.data.angle)), (ob.data.shift_x, ob.data.shift_y)
+            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(_rigid_pose(ob)), fov, shift))
+    return shots
+
+
+def _rigid_pose(ob) -> np.ndarray:
+    """(4,4) float64: where a camera stands, which way it looks and which way is up, without scale, mirroring or shear.
+    Raises InputError where its scale leaves no direction."""
+    c2w = np.array(ob.matrix_world)
+    back, up = c2w[:3, 2], c2w[:3, 1]
+    right = np.cross(up, back)
+    lengths = [np.linalg.norm(v) for v in (back, up, right)]
+    if not min(lengths) > 1e-6 * max(lengths[:2]) ** 2:
+        raise InputError(f"{ob.name}: a camera of scale 0 looks nowhere; apply another scale or unselect it.")
+    c2w[:3, 0], c2w[:3, 2] = right / lengths[2], back / lengths[0]
+    c2w[:3, 1] = np.cross(c2w[:3, 2], c2w[:3, 0])
+    return c2w
+
+
+def _capture(request: dict, progress) -> dict:
+    scene, frames = bpy.context.scene, request["frames"]
+    by_name = {ob.name_full: ob for ob in scene.objects}  # names alone are not unique: two libraries may use one
+    objects, cameras = ([by_name[n] for n in request[key]] for key in ("objects", "cameras"))
+    progress(0.02, "measuring the object")
+    simulate(frames[-1])
+    norm, aabb = normalisation(frames, objects, name=scene.name)
+    numbers, seed, rig = range(len(frames)), request.get("seed", 0), request.get("rig")
+    if cameras and not rig:
+        shots = camera_shots(scene, cameras, frames, norm, request["in_turn"])
+    else:
+        shots = rigs.RIGS[rig or "alternating"](numbers, seed)
+    shots += rigs.targets(numbers, seed, request.get("targets", 0))
+
+    def rendered(done: int, total: int) -> None:
+        progress(0.05 + 0.95 * done / total, f"rendering: picture {done} of {total}")
+
+    settings = CaptureSettings(**{key: request[key] for key in ("size", "samples", "passes", "lighting")})
+    subject = Subject(frames, norm, aabb, objects)
+    provenance = {"asset": request["name"], **tool_versions(), "scene_frames": frames}
+    capture(shots, Path(request["sequence"]), subject, settings, provenance=provenance, progress=rendered)
+    return {"pictures": len(shots)}
+
+
+if __name__ == "__main__":
+    background_blender.serve(_capture)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The list of Jobs: a row each, with its progress or its end and its buttons."""
+
+from __future__ import annotations
+
+import textwrap
+
+from ..runtime import jobs
+
+STATE_ICONS = {"waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
+
+
+def draw_jobs(layout) -> None:
+    """One row a Job, the newest first."""
+    for job in reversed(jobs.JOBS):
+        box = layout.column(align=True)
+        row = box.row(align=True)
+        if job.state == "running":
+            row.progress(factor=job.fraction, text=job.text)
+        else:
+            text = job.message if job.state == "done" else f"{job.label}: {job.message or job.text}"
+            row.label(text=text, icon=STATE_ICONS[job.state])
+        if job.state == "waiting":
+            row.operator("timesplat.bring", text="", icon="IMPORT").number = job.number
+        row.operator("timesplat.log", text="", icon="TEXT").number = job.number
+        if job.active:
+            row.operator("timesplat.cancel", text="", icon="X").number = job.number
+        elif job.state == "failed" and len(job.message) > 40:
+            for line in textwrap.wrap(job.message, 44):
+                box.label(text=line)

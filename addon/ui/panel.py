@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The Timesplat tab in the 3D view's sidebar: what to capture, with which cameras, how to reconstruct it, what is
+under way. Drawing reads settings and nothing else: no file, no evaluated object."""
+
+import bpy
+from bl_ui.utils import PresetPanel
+
+from ...datagen.sequence import InputError
+from .. import estimates, settings
+from ..operators import add_cameras
+from ..operators.presets import PRESET_ITEMS
+from ..runtime import worker_options
+from ..runtime.folders import ADDON
+from . import job_rows
+
+
+class TIMESPLAT_PT_presets(PresetPanel, bpy.types.Panel):
+    bl_label = "Timesplat Presets"
+    preset_subdir = "timesplat"
+    preset_operator = "script.execute_preset"
+    preset_add_operator = "timesplat.preset_add"
+
+
+class _Sidebar:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Timesplat"
+
+
+class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
+    bl_label = "Timesplat"
+    bl_order = 0
+
+    def draw_header_preset(self, context):
+        TIMESPLAT_PT_presets.draw_panel_header(self.layout)
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        row = layout.row(align=True)
+        for key, name, _ in PRESET_ITEMS:
+            row.operator("timesplat.preset", text=name).preset = key
+        col = layout.column(align=True)
+        try:
+            expected = estimates.estimate(chosen, context)
+        except InputError as e:
+            col.label(text=str(e), icon="ERROR")
+        else:
+            seconds = expected.rendering + expected.reconstructing
+            row = col.row(align=True)
+            row.label(text=f"{expected.pictures} pictures", icon="RENDER_RESULT")
+            row.label(text=f"about {_duration(seconds)}", icon="TIME")
+            about = "at most" if chosen.budget == "NUMBER" else "about"
+            col.label(text=f"{about} {_two_digits(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
+        if not worker_options.has_worker_python(context):
+            row = layout.row(align=True)
+            row.label(text="No runtime yet", icon="ERROR")
+            row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = ADDON
+        row = layout.row()
+        row.scale_y = 1.5
+        _reconstruct_button(row, chosen)
+        job_rows.draw_jobs(layout)
+        layout.operator("timesplat.import_asset", icon="IMPORT")
+
+
+class TIMESPLAT_PT_capture(_Sidebar, bpy.types.Panel):
+    bl_label = "Capture"
+    bl_parent_id = "TIMESPLAT_PT_panel"
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        layout.use_property_split, layout.use_property_decorate = True, False
+        layout.prop(chosen, "source")
+        if chosen.source == "COLLECTION":
+            layout.prop_search(chosen, "collection", bpy.data, "collections", text=" ")
+        layout.prop(chosen, "frame_range")
+        col = layout.column(align=True)
+        if chosen.frame_range == "CUSTOM":
+            col.prop(chosen, "frame_start")
+            col.prop(chosen, "frame_end")
+        col.prop(chosen, "every")
+        col = layout.column(align=True)
+        col.prop(chosen, "size")
+        col.prop(chosen, "samples")
+        layout.prop(chosen, "lighting")
+
+
+class TIMESPLAT_PT_cameras(_Sidebar, bpy.types.Panel):
+    bl_label = "Cameras"
+    bl_parent_id = "TIMESPLAT_PT_panel"
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        placed, description = settings.cameras(context)
+        layout.label(text=description, icon="OUTLINER_OB_CAMERA")
+        if placed:
+            layout.prop(chosen, "in_turn")
+        grid = layout.grid_flow(columns=2, align=True, even_columns=True)
+        for key, name, _ in add_cameras.RIGS:
+            grid.operator("timesplat.add_cameras", text=name).rig = key
+
+
+class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
+    bl_label = "Model"
+    bl_parent_id = "TIMESPLAT_PT_panel"
+
+    def draw(self, context):
+        layout, chosen = self.layout, context.scene.timesplat
+        layout.use_property_split, layout.use_property_decorate = True, False
+        layout.prop(chosen, "method")
+        layout.prop(chosen, "refine")
+        layout.prop(chosen, "budget")
+        if chosen.budget in ("SHARE", "NUMBER"):
+            layout.prop(chosen, chosen.budget.lower(), text=" ")
+        layout.prop(chosen, "look")
+        layout.prop(chosen, "output")
+        if preferences := worker_options.addon_preferences(context):
+            layout.prop(preferences, "checkpoint")
+            layout.prop(preferences, "device")
+
+
+class TIMESPLAT_MT_object(bpy.types.Menu):
+    """In the Object menu, which is also how the menu search (F3) finds what is in it"""
+
+    bl_label = "Timesplat Capture"
+
+    def draw(self, context):
+        layout = self.layout
+        _reconstruct_button(layout, context.scene.timesplat)
+        layout.operator("timesplat.cancel")
+        layout.operator("timesplat.bring")
+        layout.operator("timesplat.log")
+        layout.separator()
+        layout.operator_enum("timesplat.add_cameras", "rig")
+        layout.separator()
+        layout.operator("timesplat.self_test")
+
+
+def _reconstruct_button(layout, chosen) -> None:
+    """The button, with the scene's settings."""
+    operator = layout.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
+    for key in settings.KEYS:
+        setattr(operator, key, getattr(chosen, key))
+
+
+def _menu(self, context):
+    self.layout.menu("TIMESPLAT_MT_object")
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def _two_digits(count: int) -> int:
+    """Two digits of it: more are not known."""
+    return round(count, 2 - len(str(count)))
+
+
+CLASSES = (
+    TIMESPLAT_PT_presets,
+    TIMESPLAT_PT_panel,
+    TIMESPLAT_PT_capture,
+    TIMESPLAT_PT_cameras,
+    TIMESPLAT_PT_model,
+    TIMESPLAT_MT_object,
+)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.VIEW3D_MT_object.append(_menu)
+
+
+def unregister() -> None:
+    bpy.types.VIEW3D_MT_object.remove(_menu)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

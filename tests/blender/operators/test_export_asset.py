@@ -1,0 +1,414 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""File > Export: what is in the files is what the object shows, where it stands; round trips; and what is refused."""
+
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from timesplat.model.io import splat_files as formats
+from timesplat.model.io.asset import ARRAYS, VISIBLE, read_ply, rotation_matrices, write_ply
+
+from ..helpers import CLIP, make
+
+EXPORT = """
+import atexit
+part("addon").register()
+atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
+display, sliders, edit, holding = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit", "asset_object"))
+asset = part("model.asset")
+folder = sys.argv[1] + os.sep
+ob = display.add_asset(asset.read_ply(folder + "in.ply"), "Walk. 1")
+scene = bpy.context.scene
+def save(name, **options):
+    try:
+        return list(bpy.ops.timesplat.export_asset(filepath=folder + name, **options))
+    except RuntimeError as e:
+        return str(e).strip().removeprefix("Error: ")
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "files"
+    folder.mkdir()
+    write_ply(folder / "in.ply", make(120))
+    return folder
+
+
+def same(got, want, atol=4e-6, rtol=4e-6):
+    for name in ARRAYS:
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=rtol, atol=atol, err_msg=name)
+
+
+def test_4d_ply_comes_back_the_same(blender, folder):
+    told = blender(EXPORT + "tell(done=save('out.ply'), again=save('out.ply'))", folder)
+    assert told["done"] == told["again"] == ["FINISHED"]
+    asset, got = read_ply(folder / "in.ply"), read_ply(folder / "out.ply")
+    assert got.clip == asset.clip == CLIP
+    same(got, asset)
+    assert sorted(os.listdir(folder)) == ["in.ply", "out.ply"]
+
+
+def test_deleted_gaussians_and_sliders_reach_the_file(blender, folder):
+    code = """
+edit.keep_gaussians(ob, np.arange(120) % 3 > 0)
+done = [save("kept.ply")]
+sliders.set_input(sliders.asset_modifier(ob), "Time Scale", 2.0)
+sliders.set_input(sliders.asset_modifier(ob), "Lifetime Scale", 0.5)
+done += [save("applied.ply"), save("raw.ply", apply_sliders=False)]
+bpy.ops.timesplat.import_asset(filepath=folder + "kept.ply")
+tell(done=done, again=len(holding.asset_of(bpy.context.object)))
+"""
+    told = blender(EXPORT + code, folder)
+    assert told["done"] == [["FINISHED"]] * 3 and told["again"] == 80
+    asset = read_ply(folder / "in.ply")
+    kept = np.arange(120) % 3 > 0
+    for name in ("kept", "raw"):
+        got = read_ply(folder / f"{name}.ply")
+        for key in ARRAYS:
+            np.testing.assert_allclose(getattr(got, key), getattr(asset, key)[kept], rtol=4e-6, atol=4e-6)
+    got = read_ply(folder / "applied.ply")
+    assert got.clip.frame_end - got.clip.frame_start < 13 and len(got) <= 80
+    quick = asset.at(asset.frame_to_time(20))[0][kept]
+    xyz = got.at(got.frame_to_time(15))[0]  # twice as fast
+    assert np.abs(xyz[:, None] - quick[None]).max(2).min(1).max() < 1e-4
+
+
+def test_the_object_is_exported_where_it_stands(blender, folder):
+    """Moved, turned, under a parent, sheared: in the world the file's Gaussians are the object's."""
+    code = """
+from mathutils import Euler, Matrix
+parent = bpy.data.objects.new("Parent", None)
+scene.collection.objects.link(parent)
+told = {}
+def pose(name, matrix, above=None):
+    parent.matrix_world = above or Matrix()
+    ob.parent = parent if above else None
+    ob.matrix_world = matrix
+    told[name] = [save(name + ".ply"), save(name + "_slice.ply", format="SLICE"), [list(r) for r in ob.matrix_world]]
+scene.frame_set(20)
+pose("moved", Matrix.Translation((7, 8, 9)) @ Matrix.Scale(0.5, 4))
+pose("turned", Matrix.LocRotScale((1, 2, 3), Euler((0.3, 1, -2)), (2, 2, 2)))
+pose("sheared", Matrix.LocRotScale(None, Euler((0, 1, 0)), None), Matrix.LocRotScale((1, 0, 0), None, (3, 1, -0.5)))
+ob.parent = None
+ob.matrix_world = Matrix.Diagonal((1, 1, 0, 1))
+tell(flat=save("flat.ply"), **told)
+"""
+    told = blender(EXPORT + code, folder)
+    asset = read_ply(folder / "in.ply")
+    xyz, opacity = asset.at(asset.frame_to_time(20))
+    for name in ("moved", "turned", "sheared"):
+        done, sliced, matrix = told[name]
+        assert done == sliced == ["FINISHED"]
+        M = np.array(matrix)
+        got = read_ply(folder / f"{name}.ply")
+        world = xyz @ M[:3, :3].T + M[:3, 3]
+        now = got.at(got.frame_to_time(20))
+        np.testing.assert_allclose(now[0] * got.clip.scale + got.clip.translation, world, atol=2e-5)
+        np.testing.assert_allclose(now[1], opacity, atol=1e-5)
+        R = rotation_matrices(asset.rotation) * asset.soft_scale()[:, None]
+        R = M[:3, :3] @ R
+        want = R @ R.transpose(0, 2, 1)
+        S = rotation_matrices(got.rotation) * got.soft_scale()[:, None] * got.clip.scale
+        np.testing.assert_allclose(S @ S.transpose(0, 2, 1), want, rtol=2e-3, atol=1e-5 * np.abs(want).max())
+        part = formats.read(folder / f"{name}_slice.ply").asset
+        seen = world[now[1] >= VISIBLE]
+        np.testing.assert_allclose(part.xyz, np.stack([seen[:, 0], -seen[:, 2], seen[:, 1]], 1), atol=2e-5)
+    assert "scaled to nothing" in told["flat"] and "flat.ply" not in os.listdir(folder)
+
+
+def test_slices_and_their_way_back(blender, folder):
+    """A folder of slices, imported as a sequence, shows at each frame what the asset shows there."""
+    code = """
+scene.frame_start, scene.frame_end = 10, 33
+done = [save("frames", format="SLICES"), save("one.splat"), save("frames.ply", format="SLICES")]
+scene.frame_set(17)
+done.append(save("seventeen.ply", format="SLICE"))
+done.append(list(bpy.ops.timesplat.import_asset(filepath=folder + "frames", frame_start=10)))
+new, graph = bpy.context.object, bpy.context.evaluated_depsgraph_get()
+edit_asset = holding.asset_of(new)
+shown = {}
+for frame in (10, 17, 33):
+    position, alpha = edit_asset.at(edit_asset.frame_to_time(frame))
+    shown[frame] = (np.c_[position, np.ones(len(position))] @ np.array(new.matrix_world).T)[alpha >= 0.05, :3].tolist()
+tell(done=done, shown=shown)
+"""
+    told = blender(EXPORT + code, folder)
+    assert told["done"][:2] == [["FINISHED"]] * 2 and told["done"][3:] == [["FINISHED"]] * 2
+    assert "exists already" in told["done"][2]
+    assert sorted(os.listdir(folder / "frames")) == [f"frames_{f:04d}.ply" for f in range(10, 34)]
+    assert (folder / "seventeen.ply").read_bytes() == (folder / "frames/frames_0017.ply").read_bytes()
+    asset = read_ply(folder / "in.ply")
+    for frame, got in told["shown"].items():
+        xyz, opacity = asset.at(asset.frame_to_time(int(frame)))
+        np.testing.assert_allclose(got, xyz[opacity >= VISIBLE] * 2.5 + [1, -2, 3], atol=2e-5)
+
+
+TIMELINE = """
+def key(owner, name, values):
+    for frame, value in values.items():
+        setattr(owner, name, value)
+        owner.keyframe_insert(name, frame=frame)
+def world():
+    for i in bpy.context.evaluated_depsgraph_get().object_instances:  # where a mesh stands in, it is an instance of it
+        if i.object.type == "POINTCLOUD" and (i.object.original == ob or i.parent and i.parent.original == ob):
+            return [list(i.matrix_world @ p.co) for p in i.object.data.points]
+    return []
+def at(frames):
+    found = {}
+    for f in frames:
+        scene.frame_set(f)
+        found[f] = [world(), [list(r) for r in ob.matrix_world]]
+    return found
+said, operator = [], part("addon.operators.export_asset").TIMESPLAT_OT_export_asset
+def write(self, *a, before=operator.write):
+    said.append(before(self, *a))
+    return said[-1]
+operator.write = write
+"""
+
+
+@pytest.mark.parametrize("repeat", ["Hold", "Loop", "Ping-Pong"])
+def test_slices_are_what_the_timeline_shows(blender, folder, repeat):
+    """At every frame of the scene, with animated sliders and a place that is animated; grown from nothing."""
+    code = f"""
+modifier = sliders.asset_modifier(ob)
+sliders.set_input(modifier, "Repeat", {repeat!r})
+sliders.set_input(modifier, "Time Scale", 1.5)
+def slide(name, values):
+    for frame, value in values.items():
+        sliders.set_input(modifier, name, value)
+        owner, key = sliders.input_property(modifier, name)
+        owner.keyframe_insert(key, frame=frame)
+slide("Density", {{8: 1.0, 30: 0.4, 36: 0.0}})
+slide("Opacity Cut", {{8: 0.0, 30: 0.3}})
+key(ob, "location", {{8: (0, 0, 0), 40: (4, 0, 1)}})
+key(ob, "scale", {{8: (0, 0, 0), 12: (2, 2, 2)}})
+scene.frame_start, scene.frame_end = 8, 40
+scene.frame_set(20, subframe=0.5)
+done, now = save("frames", format="SLICES"), scene.frame_current_final
+one = save("one.ply", format="SLICE"), world()
+scene.frame_set(36)
+save("none.splat")
+scene.frame_set(20, subframe=0.5)
+tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)), said=said)
+"""
+    told = blender(EXPORT + TIMELINE + code, folder)
+    assert told["done"] == ["FINISHED"] and told["now"] == 20.5
+    shown = {f: w for f, (w, _) in told["shown"].items()} | {"one": told["one"][1]}
+    counts = set()
+    for frame, want in shown.items():
+        name = "one.ply" if frame == "one" else f"frames/frames_{int(frame):04d}.ply"
+        got = formats.read(folder / name).asset
+        if not want or frame == "8":  # a clear one stands in
+            assert len(got) == 1 and got.opacity[0] < 1e-5
+            continue
+        counts.add(len(want))
+        want = np.array(want)
+        np.testing.assert_allclose(got.xyz, np.stack([want[:, 0], -want[:, 2], want[:, 1]], 1), atol=2e-5)
+    assert told["said"][2] == ["WARNING", "Nothing is shown at frame 36; one clear Gaussian stands in."]
+    assert len(counts) > 10 and len(os.listdir(folder / "frames")) == 33
+    if repeat == "Hold":
+        animated = "Animated, but in the file as at frame 20.5: Opacity Cut, Density, place."
+        assert told["said"][-1][0] == "WARNING" and animated in told["said"][-1][1]
+    else:
+        assert f"Repeat is {repeat}" in told["refused"] and "export 3DGS PLY, all frames" in told["refused"]
+
+
+def test_an_object_that_moves(blender, folder):
+    """USD has its motion, in every mode and through its way back; a .ply has where it is now."""
+    pytest.importorskip("pxr")
+    from timesplat.model.io import usd_write as usd
+
+    code = """
+from mathutils import Euler, Matrix
+parent = bpy.data.objects.new("Parent", None)
+scene.collection.objects.link(parent)
+key(parent, "rotation_euler", {10: (0, 0, 0), 30: (0.5, -4, 1)})
+ob.parent = parent
+key(ob, "location", {12: (1, 0, 0), 33: (1, 2, 3)})
+scene.frame_set(20)
+done = [save("now.ply"), save("a.usdz"), save("b.usda", mode="frames", half=True), save("c.usdc", mode="points")]
+want = at(range(10, 34))
+scene.frame_set(5)
+done.append(list(bpy.ops.timesplat.import_asset(filepath=folder + "a.usdz")))
+ob = bpy.context.object
+got = at(range(10, 34))
+done.append(save("again.usdc"))
+ob.parent = parent  # what turns may shear what is scaled
+parent.scale = (1, 3, 1)
+done += [save("sheared.usdc"), list(bpy.ops.timesplat.import_asset(filepath=folder + "sheared.usdc"))]
+tell(done=done, want=want, got=got, said=said, keyed=bool(bpy.context.object.animation_data))
+"""
+    told = blender(EXPORT + TIMELINE + code, folder, env={"TIMESPLAT_PYTHON": sys.executable})
+    assert told["done"] == [["FINISHED"]] * 8 and not told["keyed"]
+    assert "Animated, but in the file as at frame 20: place." in told["said"][0][1]
+    assert [level for level, _ in told["said"][1:]] == ["INFO"] * 5 and "valid USD" in told["said"][1][1]
+    asset = read_ply(folder / "in.ply")
+    for name in ("a.usdz", "b.usda", "c.usdc", "again.usdc"):
+        assert usd.check_usd(folder / name) == []
+        got, motion = usd.read_moving(folder / name)
+        for frame, (points, matrix) in told["want"].items():
+            xyz, opacity = got.at(got.frame_to_time(int(frame)))
+            xyz = (xyz * got.clip.scale + got.clip.translation)[opacity >= VISIBLE]
+            M = motion[int(frame) - 10]
+            place = np.array(matrix)
+            if name != "b.usda":  # half precision moves a Gaussian across the limit of what is seen
+                np.testing.assert_allclose(xyz @ M[:3, :3].T + M[:3, 3], points, atol=3e-4)
+                np.testing.assert_allclose(told["got"][frame][0], points, atol=3e-5)
+            now = asset.at(asset.frame_to_time(int(frame)))[0]
+            np.testing.assert_allclose(
+                (got.at(got.frame_to_time(int(frame)))[0] * got.clip.scale + got.clip.translation) @ M[:3, :3].T
+                + M[:3, 3], now @ place[:3, :3].T + place[:3, 3], atol=5e-3 if name == "b.usda" else 3e-4,
+            )  # fmt: skip
+    got, place = read_ply(folder / "now.ply"), told["want"]["20"][0]
+    xyz, opacity = got.at(got.frame_to_time(20))
+    world = (xyz * got.clip.scale + got.clip.translation)[opacity >= VISIBLE]
+    np.testing.assert_allclose(world, place, atol=3e-5)
+
+
+def test_usd_is_written_checked_and_read_again(blender, folder):
+    pytest.importorskip("pxr")
+    from timesplat.model.io import usd_write as usd
+
+    code = """
+import importlib.util
+result, named = {}, os.environ["TIMESPLAT_PYTHON"]
+for key in ["worker", "direct"] if importlib.util.find_spec("pxr") else ["worker"]:
+    os.environ["TIMESPLAT_PYTHON"] = named if key == "worker" else "/nowhere/python"
+    for n, options in {"a.usdc": {}, "b.usdz": {"half": True}, "c.usda": {"mode": "points"}, "d": {"format": "USDC",
+                       "mode": "frames"}}.items():
+        result[key + "_" + n] = [save(key + "_" + n, **options), bpy.data.texts["Timesplat USD report"].as_string()]
+tell(**result, left=os.listdir(os.environ["TMPDIR"]))
+"""
+    told = blender(EXPORT + code, folder, env={"TIMESPLAT_PYTHON": sys.executable})
+    assert not [n for n in told.pop("left") if n.startswith("timesplat-")]
+    asset = read_ply(folder / "in.ply")
+    for name, (done, report) in told.items():
+        path = folder / (name if "." in name else f"{name}.usdc")
+        assert done == ["FINISHED"] and "120 Gaussians" in report, done
+        assert usd.check_usd(path) == [] and report.splitlines()[2] == "valid USD"
+        half = name.endswith("z")
+        got = usd.read_usd(path)
+        np.testing.assert_allclose(got.clip.translation, asset.clip.translation)
+        same(got, asset, atol=1e-3 if half else 4e-6, rtol=2e-3 if half else 4e-6)
+
+
+def test_complaints_are_told_and_kept_as_a_text(blender, folder):
+    code = """
+exporter = part("addon.operators.export_asset")
+exporter.write_usd = lambda path, *a, **k: path.write_text("x") and ["it is blue", "it is round"]
+tell(done=save("a.usda"), text=bpy.data.texts["Timesplat USD report"].as_string())
+"""
+    told = blender(EXPORT + code, folder)
+    assert told["done"] == ["FINISHED"]
+    assert "2 complaints" in told["text"] and told["text"].endswith("it is blue\nit is round\n")
+
+
+def test_with_original(blender, folder):
+    """The variant set has both; the scene is as it was."""
+    Usd = pytest.importorskip("pxr.Usd")
+    code = """
+def cube(name, x):
+    bpy.ops.mesh.primitive_cube_add(size=1, location=(x, 0, 0))
+    bpy.context.object.name = name
+    return bpy.context.object
+cube("Other", 9)
+original = cube("Walker", 1)
+for frame, x in ((10, 1.0), (33, 3.0)):
+    original.location.x = x
+    original.keyframe_insert("location", frame=frame)
+other = bpy.data.objects["Other"]
+original.hide_set(True)
+bpy.ops.object.select_all(action="DESELECT")
+other.select_set(True)
+bpy.context.view_layer.objects.active = ob
+scene.frame_start, scene.frame_end = 1, 5
+scene.frame_set(21, subframe=0.25)
+told = {"unknown": save("u.usdz", with_original=True)}
+ob["timesplat_source"] = ["Walker", "Gone"]
+told["usdz"], told["usdc"] = save("a.usdz", with_original=True), save("b.usdc", with_original=True)
+exporter = part("addon.operators.export_asset")
+def fails(*a, **k):
+    raise part("datagen.sequence").InputError("a.ply: the disk is full; make room.")
+exporter.write_usd = fails
+told["full"] = save("c.usdc", with_original=True)
+tell(**told, selected=[o.name for o in bpy.context.selected_objects], active=bpy.context.object.name,
+     hidden=[original.hide_get(), original.hide_viewport], range=[scene.frame_start, scene.frame_end],
+     frame=scene.frame_current_final, usd=bpy.app.build_options.usd)
+"""
+    told = blender(EXPORT + code, folder, env={"TIMESPLAT_PYTHON": sys.executable})
+    assert told["selected"] == ["Other"] and told["active"] == "Walk. 1" and told["hidden"] == [True, False]
+    assert told["range"] == [1, 5] and told["frame"] == 21.25
+    if not told["usd"]:
+        assert "built without USD" in told["usdz"] and sorted(os.listdir(folder)) == ["in.ply"]
+        return
+    assert "was made from is not in this view layer" in told["unknown"] and "disk is full" in told["full"]
+    assert told["usdz"] == told["usdc"] == ["FINISHED"]
+    assert sorted(os.listdir(folder)) == ["a.usdz", "b.usdc", "b_original.usdc", "in.ply"]
+    from pxr import UsdGeom
+
+    for name in ("a.usdz", "b.usdc"):
+        stage = Usd.Stage.Open(str(folder / name))
+        (variants,) = [p.GetVariantSets() for p in stage.Traverse() if p.HasVariantSets()][:1]
+        (kind,) = variants.GetNames()
+        assert set(variants.GetVariantSet(kind).GetVariantNames()) == {"original", "reconstruction"}
+        variants.GetVariantSet(kind).SetVariantSelection("original")
+        meshes = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+        assert len(meshes) == 1
+        for frame, x in ((10, 1), (33, 3)):
+            place = UsdGeom.Xformable(meshes[0]).ComputeLocalToWorldTransform(frame).ExtractTranslation()
+            np.testing.assert_allclose(place, [x, 0, 0], atol=1e-4)
+
+
+def test_what_cannot_be_exported_gets_a_sentence(blender, folder):
+    code = """
+told = {"place": save("in.ply/x.ply"), "folder": save("in.ply/x", format="SLICES")}
+bpy.ops.mesh.primitive_cube_add()
+told["cube"] = bpy.ops.timesplat.export_asset.poll()
+told["why"] = save("c.ply")
+bpy.context.view_layer.objects.active = ob
+told["can"] = bpy.ops.timesplat.export_asset.poll()
+tell(**told)
+"""
+    told = blender(EXPORT + code, folder)
+    assert told["cube"] is False and told["can"] is True and "Select a Timesplat asset" in told["why"]
+    for key in ("place", "folder"):
+        assert "in.ply" in told[key] and "Traceback" not in told[key] and "\n" not in told[key], told[key]
+    assert sorted(os.listdir(folder)) == ["in.ply"]
+
+
+def test_names_follow_the_format(blender, tmp_path):
+    code = """
+part("addon").register()
+exporter = part("addon.operators.export_asset")
+menu = [d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs]
+part("addon").unregister()
+f, k = exporter.with_suffix, exporter.format_of
+tell(names=[f("/x/a", "USDZ"), f("/x/a.ply", "USDC"), f("/x/a.v2", "PLY"), f("/x/a.v2.USDA", "SLICES")],
+     typed=[k("a.usdz", "PLY"), k("a", "USDA"), k("a.v2", "USDA"), k("a.PLY", "SLICE"), k("a.ply", "SLICES")],
+     kinds=sorted(exporter.SUFFIXES) == sorted(i[0] for i in exporter.FORMAT_ITEMS), menu=menu,
+     gone=[d.__module__ for d in bpy.types.TOPBAR_MT_file_export.draw._draw_funcs])
+"""
+    told = blender(code)
+    assert told["names"] == ["/x/a.usdz", "/x/a.usdc", "/x/a.v2.ply", "/x/a.v2"] and told["kinds"]
+    assert told["typed"] == ["USDZ", "USDA", "USDA", "SLICE", "PLY"]
+    module = "timesplat.addon.operators.export_asset"
+    assert module in told["menu"] and module not in told["gone"]
+
+
+def test_installed_as_an_extension(installed, folder):
+    """From the .zip, by its operators alone: in, out as USD, in again."""
+    code = """
+folder = sys.argv[1] + os.sep
+ops, steps = bpy.ops.timesplat, []
+for kind, name in ("import", "in.ply"), ("export", "out.usdz"), ("import", "out.usdz"), ("export", "out.ply"):
+    steps.append(getattr(ops, kind + "_asset")(filepath=folder + name))
+tell(steps=[list(s) for s in steps], modules=[m for m in sys.modules if m.split(".")[0] in ("timesplat", "torch")])
+"""
+    pytest.importorskip("pxr")
+    told = installed(code, folder)
+    assert told["steps"] == [["FINISHED"]] * 4 and told["modules"] == []
+    same(read_ply(folder / "out.ply"), read_ply(folder / "in.ply"))
