@@ -25,10 +25,16 @@ setup: $(VENV)/.ready ## the environment alone
 demo: $(VENV)/.ready ## render, reconstruct and export a procedural animated object into out/demo
 	$(BIN)/timesplat demo --out out/demo
 
-test: $(VENV)/.ready ## all tests, lint included
+test: lint types ## lint, types and all tests
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.ready ## ruff alone
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -m pytest
+
+types: $(VENV)/.ready ## mypy alone; the link gives the package its name whatever this folder is called
+	@mkdir -p $(VENV)/types && ln -sfn ../.. $(VENV)/types/timesplat
+	$(BIN)/mypy
 
 test-blender: $(VENV)/.ready ## the add-on's tests under BLENDER=/path/to/blender, or a Python that has bpy
 	TIMESPLAT_BLENDER=$(BLENDER) $(BIN)/python -m pytest tests/blender
@@ -48,4 +54,4 @@ zip: $(VENV)/.ready ## the Blender extension, into dist/
 clean:           ## what can be made again
 	rm -rf $(VENV) .venv-bpy* out dist build *.egg-info
 
-.PHONY: help setup demo test test-blender test-blenders zip clean
+.PHONY: help setup demo test lint types test-blender test-blenders zip clean

@@ -107,6 +107,13 @@ class Sequence:
         c2w = opengl_to_opencv(np.stack([v.c2w for v in views]))
         return c2w.astype(np.float32), np.array([[v.fx, v.fy, v.cx, v.cy] for v in views], np.float32)
 
+    @property
+    def folder(self) -> Path:
+        """Where it was read from. Raises ValueError for one that is not on disk."""
+        if self.root is None:
+            raise ValueError("this Sequence is not on disk yet")
+        return self.root
+
     def select(self, *, camera: str | None = None, rig: str | None = None, frame: int | None = None) -> list[int]:
         """Indices of the views that match every argument given."""
         return [
@@ -121,7 +128,7 @@ class Sequence:
         """(H,W,4) uint8 RGBA, straight alpha, sRGB-encoded. Raises InputError naming the file."""
         from PIL import Image
 
-        path = self.root / self.views[index].image
+        path = self.folder / self.views[index].image
         try:
             with Image.open(path) as im:
                 rgba = np.asarray(im.convert("RGBA"))
@@ -144,7 +151,7 @@ class Sequence:
                 f"{self.root}: view {view.image} has no depth pass; render with passes, or use a method "
                 "that needs none (rgb)."
             )
-        return read_passes(self.root / view.passes, (self.height, self.width))
+        return read_passes(self.folder / view.passes, (self.height, self.width))
 
 
 @dataclass
@@ -339,15 +346,14 @@ def read_sequence(folder: Path) -> Sequence:
     try:
         d = json.loads(path.read_text(encoding="utf-8"))
         norm = d.get("normalisation", {})
+        x, y, z = norm.get("translation", (0, 0, 0))
         seq = Sequence(
             width=int(d["w"]),
             height=int(d["h"]),
             fps=float(d.get("fps", 24.0)),
             frame_start=int(d.get("frame_start", 0)),
             frame_end=int(d.get("frame_end", 0)),
-            normalisation=Normalisation(
-                float(norm.get("scale", 1.0)), tuple(float(x) for x in norm.get("translation", (0, 0, 0)))
-            ),
+            normalisation=Normalisation(float(norm.get("scale", 1.0)), (float(x), float(y), float(z))),
             aabb=d.get("aabb", [[-1, -1, -1], [1, 1, 1]]),
             provenance=d.get("provenance", {}),
             root=folder,

@@ -290,7 +290,7 @@ def score(ready: list[Run], options: AblationOptions) -> dict[str, Scores]:
         for spec in (parse_spec(f"{r.name}={method}@{weights_of(r, options)}"), parse_spec("white")):
             for name, seq in held_out.items():
                 views = (tuple(protocol.all_inputs(seq)), tuple(protocol.held_out(seq)))
-                runs.append(runner.Run(name, seq.root, spec, *views, seq.width // shrink))
+                runs.append(runner.Run(name, seq.folder, spec, *views, seq.width // shrink))
                 at.append((r.name, spec.label))
     conditions = runner.Conditions(left_out=tuple(k for k in METRICS if k not in ("psnr", "psnr_fg")), one_thread=True)
     rows = runner.run_all(runs, Cache(options.out), conditions, "scoring")
@@ -299,7 +299,8 @@ def score(ready: list[Run], options: AblationOptions) -> dict[str, Scores]:
         found.setdefault(key, []).append(x)
 
     def figures(name: str, label: str) -> tuple[list[float], list[float]]:
-        return tuple([x[k] for x in found[name, label]] for k in ("psnr", "psnr_fg"))
+        rows = found[name, label]
+        return [x["psnr"] for x in rows], [x["psnr_fg"] for x in rows]
 
     return {
         r.name: Scores(found[r.name, r.name][0]["size"], *figures(r.name, r.name), *figures(r.name, "white"))

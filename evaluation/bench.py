@@ -252,7 +252,7 @@ def runs_of(sequences: dict[str, Sequence], points: list[Point], axes: Axes = AX
         stages.setdefault((fit, False) if fit > axes.quick else (0, elsewhere), []).append(p)
     return [
         Run(
-            n, seq.root, p.method, tuple(_inputs(seq, p.setup)), tuple(protocol.held_out(seq)), p.size,
+            n, seq.folder, p.method, tuple(_inputs(seq, p.setup)), tuple(protocol.held_out(seq)), p.size,
             {"setup": p.setup},
         )
         for k in sorted(stages) for n, seq in sequences.items() for p in stages[k]

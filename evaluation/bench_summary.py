@@ -78,6 +78,12 @@ class Mean:
     gain: dict[str, float] = field(default_factory=dict)  # of metrics against the centre, same objects
     gain_error: dict[str, float] = field(default_factory=dict)  # standard errors of these paired differences
 
+    def __getitem__(self, key: str) -> float:
+        """The mean of a figure that there is."""
+        value = self.mean[key]
+        assert value is not None, f"{self.method.label} has no {key}"
+        return value
+
 
 def reference(method: MethodSpec) -> str:
     """The one at the centre that a method is compared with: they see the same."""
@@ -94,11 +100,14 @@ def summarise(rows: list[dict], centre: tuple[str, int]) -> list[Mean]:
     for (label, setup, size), objects in groups.items():
         if len(objects) < most:
             continue
-        method, mean, error = parse_spec(label, seconds=10.0), {}, {}
+        method = parse_spec(label, seconds=10.0)
+        mean: dict[str, float | None] = {}
+        error: dict[str, float] = {}
         for k in FIGURES:
             values = [r[k] for r in objects.values()]
             known = None not in values
-            mean[k], error[k] = (float(np.mean(values)), standard_error(values)) if known else (None, 0.0)
+            mean[k] = float(np.mean(values)) if known else None
+            error[k] = standard_error(values) if known else 0.0
         m = Mean(method, setup, next(iter(objects.values()))["views"], size, len(objects), mean, error)
         other = groups.get((reference(method), *centre), {})
         for k in METRICS:

@@ -102,7 +102,7 @@ def lines(means: list[Mean]) -> dict[str, list[Mean]]:
         if what == "budget":
             whole = f"{head}+refine:{refine:g}" if refine else head
             group = [m for m in means if m.method.label == whole] + group
-            out[f"{whole}+budget"] = sorted(group, key=lambda m: m.mean["gaussians"])
+            out[f"{whole}+budget"] = sorted(group, key=lambda m: m["gaussians"])
         elif what == "dense":
             out |= {m.method.label: [m] for m in group}
         else:
@@ -116,9 +116,11 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
     upside down, so that up is better."""
     means = [m for m in means if m.mean[cost]]
     ax.set(xscale="log", xlabel=NAMES[cost], ylabel=axis_name(worth))
-    labels, hints, drawn = [], [], []
+    labels: list[tuple] = []
+    hints: list[tuple] = []
+    drawn: list[tuple] = []
     for label, group in lines(means).items():
-        x, y = [m.mean[cost] for m in group], [m.mean[worth] for m in group]
+        x, y = [m[cost] for m in group], [m[worth] for m in group]
         colour, budget = FAMILIES[group[0].method.method], "budget" in label
         ax.plot(x, y, color=colour, linewidth=1, zorder=2, linestyle="--" if budget else "-")
         drawn.append((x, y))
@@ -131,17 +133,17 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
             found = [(a, b, hint(m), colour) for a, b, m in zip(x, y, group, strict=True)]
             hints += [h for h in found if h[2] and h[:3] not in said]
     for m in means:
-        x, y, colour, error = m.mean[cost], m.mean[worth], FAMILIES[m.method.method], m.gain_error.get(worth, 0)
-        drawn.append(([x, x], [y - error, y + error]))
+        at_x, at_y, colour, error = m[cost], m[worth], FAMILIES[m.method.method], m.gain_error.get(worth, 0)
+        drawn.append(([at_x, at_x], [at_y - error, at_y + error]))
         ax.errorbar(
-            x, y, yerr=error or None, color=colour, ecolor=colour, elinewidth=0.8, capsize=2, linestyle="none",
+            at_x, at_y, yerr=error or None, color=colour, ecolor=colour, elinewidth=0.8, capsize=2, linestyle="none",
             marker="s" if m.method.has_depth else "o", zorder=4,
             markersize=3 if cost == "seconds" and m.method.budget else 5,
             markerfacecolor="white" if m.method.baseline else colour,
         )  # fmt: skip
     for has_depth in (True, False):
         best = on_frontier([m for m in means if m.method.has_depth == has_depth], cost, worth)
-        x, y = [m.mean[cost] for m in best], [m.mean[worth] for m in best]
+        x, y = [m[cost] for m in best], [m[worth] for m in best]
         look = {"color": "#606060", "drawstyle": "steps-post", "zorder": 1}
         ax.plot(x, y, linewidth=5, alpha=0.15, **look)
         ax.plot(x, y, linewidth=0.9, linestyle="-" if has_depth else ":", **look)
@@ -150,7 +152,7 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
     if not METRICS[worth].higher_is_better:
         ax.invert_yaxis()
     plain(ax)
-    dots = [(m.mean[cost], m.mean[worth]) for m in means]
+    dots = [(m[cost], m[worth]) for m in means]
     return ax, labels, hints, drawn, dots
 
 
@@ -163,14 +165,15 @@ def on_frontier(means: list[Mean], cost: str, worth: str) -> list[Mean]:
     """Those on the Pareto frontier, cheapest first."""
     means = [m for m in means if m.mean[cost] is not None]
     sign = 1 if METRICS[worth].higher_is_better else -1
-    return [means[i] for i in frontier([m.mean[cost] for m in means], [sign * m.mean[worth] for m in means])]
+    return [means[i] for i in frontier([m[cost] for m in means], [sign * m[worth] for m in means])]
 
 
 def key(ax, means: list[Mean]) -> None:
     """What the markers and the grey lines mean, above a panel."""
     from matplotlib.lines import Line2D
 
-    made, look = [], {"color": "#404040", "linestyle": "none", "markersize": 5}
+    made = []
+    look: dict = {"color": "#404040", "linestyle": "none", "markersize": 5}
     for has_depth in (True, False):
         if any(m.method.has_depth == has_depth for m in means):
             mark, style = ("s", "-") if has_depth else ("o", ":")
@@ -202,7 +205,7 @@ def budgets(rows: list[dict], centre: tuple[str, int]) -> dict[str, dict[str, li
 def draw_budgets(losses: dict):
     """A panel for each method: what an object loses when it has fewer Gaussians; a star is what `auto` chose."""
     fig, axes = panels(len(losses), 5.6, 4.2)
-    work = []
+    work: list[tuple] = []
     for ax, (whole, curves) in zip(axes, losses.items(), strict=True):
         labels, drawn = [], []
         for i, (name, curve) in enumerate(curves.items()):
@@ -234,13 +237,13 @@ def draw_inputs(means: list[Mean], setup: str, size: int):
     plans = [("views", "psnr", by_views), ("views", "seconds", by_views), ("seconds", "psnr", by_size)]
     plans = [p for p in plans if len({(m.setup, m.size) for m in p[2]}) > 1]
     fig, axes = panels(len(plans), 4.6, 4.2)
-    work = []
+    work: list[tuple] = []
     for ax, (x_name, y_name, part) in zip(axes, plans, strict=True):
         labels, hints, drawn = [], [], []
         for w in chosen:
             line = sorted((m for m in part if m.method.label == w), key=lambda m: (m.views, m.size))
-            x = [m.views if x_name == "views" else m.mean["seconds"] for m in line]
-            y, method, colour = [m.mean[y_name] for m in line], line[0].method, FAMILIES[line[0].method.method]
+            x = [m.views if x_name == "views" else m["seconds"] for m in line]
+            y, method, colour = [m[y_name] for m in line], line[0].method, FAMILIES[line[0].method.method]
             ax.plot(
                 x, y, color=colour, linewidth=1.2, marker="s" if method.has_depth else "o", markersize=4.5,
                 linestyle="--" if "refine" in w else "-", markerfacecolor="white" if method.baseline else colour,
@@ -349,7 +352,7 @@ def frontiers(centre: list[Mean]) -> str:
     lines = ["| frontier | among ways that see | on it, cheapest first | baselines on it |", "|---|---|---|---|"]
     pairs = [(k, "seconds") for k in charted(centre)] + [("psnr", "gaussians"), ("psnr", "usd_mb")]
     for worth, cost in pairs:
-        if not any(m.mean[cost] for m in centre):
+        if not any(m[cost] for m in centre):
             continue
         for sees in (True, False, None):
             group = [m for m in centre if sees is None or m.method.has_depth == sees]

@@ -31,17 +31,18 @@ def contact_sheet(seq: Sequence, frames: int):
     for i, v in enumerate(seq.views):
         name = v.camera if len(rigs[v.camera]) == 1 else f"{v.camera}, {v.rig}"
         cameras.setdefault(name, {})[v.frame] = i
-    rows, first = {}, None
-    for name, at in cameras.items():
-        indices = [at.get(f) for f in chosen]
-        if any(i is not None for i in indices):
-            rows[name] = torch.stack([_picture(seq, i) for i in indices])
-            first = first or (name, [i for i in indices if i is not None] if None not in indices else [])
-    name, indices = first
-    if indices and all(seq.views[i].passes for i in indices):
-        views = load_views(seq, indices, passes=True)
+    rows: dict[str, torch.Tensor] = {}
+    taken = {name: [at.get(f) for f in chosen] for name, at in cameras.items()}
+    shown = {name: indices for name, indices in taken.items() if any(i is not None for i in indices)}
+    for name, indices in shown.items():
+        rows[name] = torch.stack([_picture(seq, i) for i in indices])
+    name, indices = next(iter(shown.items()))
+    whole = [i for i in indices if i is not None and seq.views[i].passes]
+    if len(whole) == len(indices):
+        views = load_views(seq, whole, passes=True)
+        assert views.depth is not None and views.flow is not None
         rows[f"depth, {name}"] = _depth(views.depth)
-        rows[f"motion, {name}"] = _motion(views.flow[..., :2])
+        rows[f"motion, {name}"] = _motion(views.flow[..., :2].nan_to_num(0).numpy())
     return grid(rows, [f"frame {f}" for f in chosen])
 
 
@@ -58,11 +59,10 @@ def _depth(depth: torch.Tensor) -> torch.Tensor:
     return torch.where(depth.isfinite(), grey, 1.0)[..., None].expand(-1, -1, -1, 3)
 
 
-def _motion(flow: torch.Tensor) -> torch.Tensor:
+def _motion(flow: np.ndarray) -> torch.Tensor:
     """flow (n,H,W,2) in pixels a frame -> (n,H,W,3)."""
     from matplotlib.colors import hsv_to_rgb
 
-    flow = flow.nan_to_num(0).numpy()
     length = np.linalg.norm(flow, axis=-1)
     hue = (np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi)) % 1
     most = max(float(np.percentile(length[length > 0], 98)) if (length > 0).any() else 1.0, 1e-6)

@@ -71,9 +71,10 @@ def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
 
     name, cache, conditions = str(seq.provenance.get("asset", "demo")), Cache(out / "cache"), Conditions(scenes=True)
     where = (tuple(inputs), tuple(targets), seq.width, {"setup": "", "stride": 1})
-    runs = [Run(name, seq.root, parse_spec(m), *where) for m in METHODS]
+    runs = [Run(name, seq.folder, parse_spec(m), *where) for m in METHODS]
     rows = run_all(runs, cache, conditions, "reconstructing")
-    scenes = {m: cache.scene(key_of(r, conditions)) for m, r in zip(METHODS, runs, strict=True)}
+    kept = {m: cache.scene(key_of(r, conditions)) for m, r in zip(METHODS, runs, strict=True)}
+    scenes = {m: g for m, g in kept.items() if g is not None}  # all of them: they are 4D Gaussians
     for row in rows:
         seconds[row["method"]] = row["seconds"]
 

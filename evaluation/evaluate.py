@@ -116,10 +116,10 @@ def evaluate(options: EvaluateOptions) -> int:
 
 
 def plan(
-    sequences: dict[str, Sequence], methods: list[MethodSpec], setups: list[str], sizes: dict[int | None, int]
+    sequences: dict[str, Sequence], methods: list[MethodSpec], setups: list[str], sizes: dict[int, int]
 ) -> list[Run]:
     """Every method on every Sequence {name: Sequence} in every setup ("" for all views that are not held out) at every
-    size {pixels, None for the Sequence's own: score every n-th frame}. Raises InputError where views are missing."""
+    size {pixels: score every n-th frame}. Raises InputError where views are missing."""
     from .runner import Run
 
     runs = []
@@ -128,8 +128,8 @@ def plan(
             inputs = protocol.inputs(seq, setup) if setup else protocol.all_inputs(seq)
             for size, stride in sizes.items():
                 targets, labels = protocol.targets(seq, stride), {"setup": setup, "stride": stride}
-                at = (tuple(inputs), tuple(targets), size or seq.width, labels)
-                runs += [Run(name, seq.root, m, *at) for m in methods if (m.method, setup) not in NOT_FOR]
+                at = (tuple(inputs), tuple(targets), size, labels)
+                runs += [Run(name, seq.folder, m, *at) for m in methods if (m.method, setup) not in NOT_FOR]
     return runs
 
 

@@ -142,7 +142,7 @@ def save_picture(image, stem: Path, caption: str) -> None:
     write_whole(stem.with_name(stem.name + ".svg"), svg.encode())
 
 
-def smooth(values: np.ndarray, window: int) -> np.ndarray:
+def smooth(values: Sequence[float] | np.ndarray, window: int) -> np.ndarray:
     """(n,) running mean over `window` values, centred, over what is there at the ends."""
     values = np.asarray(values, float)
     kernel = np.ones(min(window, len(values)) or 1)

@@ -67,7 +67,9 @@ def features(picture: Tensor) -> Tensor:
     def passes(x: Tensor, down: str, across: str) -> Tensor:
         return _matrix(down, height).to(x) @ x @ _matrix(across, width).to(x).T
 
-    blue = sum(k * passes(opponent[2], f"BY{i}", f"BY{i}") for i, k in enumerate(_shares("BY")))
+    blue = torch.zeros_like(opponent[2])
+    for i, k in enumerate(_shares("BY")):
+        blue = blue + k * passes(opponent[2], f"BY{i}", f"BY{i}")
     seen = torch.stack([passes(opponent[0], "A0", "A0"), passes(opponent[1], "RG0", "RG0"), blue])
     rgb = torch.einsum("ij,jhw->ihw", torch.linalg.inv(OPPONENT @ XYZ).to(picture), seen).clamp(0, 1)
     lab = hunt(torch.einsum("ij,jhw->ihw", XYZ.to(picture), rgb))

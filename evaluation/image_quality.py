@@ -53,9 +53,9 @@ def _ssim(x: Tensor, y: Tensor) -> Tensor:
     """x, y (C,H,W) -> (C,H-10,W-10) the index of each window."""
     height, width = x.shape[-2:]
     w = torch.exp(-0.5 * ((torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2) / 1.5) ** 2)
-    w = tuple((w / w.sum()).tolist())
+    kernel = tuple((w / w.sum()).tolist())
     maps = torch.stack([x, y, x * x, y * y, x * y])
-    maps = valid(w, height).to(x) @ maps @ valid(w, width).to(x).T
+    maps = valid(kernel, height).to(x) @ maps @ valid(kernel, width).to(x).T
     mx, my, xx, yy, xy = maps
     vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
     c1, c2 = 0.01**2, 0.03**2
@@ -77,7 +77,7 @@ def shown(x: Tensor, y: Tensor, margin: int) -> tuple[slice, slice]:
     pixels wider on every side, as far as there are any; its sides are multiples of STEP or the whole picture.
     Empty slices where both are white."""
     ink = (x < 1).any(-1) | (y < 1).any(-1)
-    return tuple(_span(ink.any(axis), margin) for axis in (1, 0))
+    return _span(ink.any(1), margin), _span(ink.any(0), margin)
 
 
 def _span(ink: Tensor, margin: int) -> slice:

@@ -33,7 +33,8 @@ def place(ax, labels: list[tuple], hints: list[tuple], drawn: list[tuple], dots:
     figure = ax.figure
     figure.canvas.draw()
     pen, dot = figure.canvas.get_renderer(), figure.dpi / 72
-    inside, busy, boxes = ax.get_window_extent(pen), np.zeros((0, 2)), []
+    inside, busy = ax.get_window_extent(pen), np.zeros((0, 2))
+    boxes: list[tuple] = []
     for xs, ys in drawn:
         at = ax.transData.transform(np.stack([xs, ys], -1)) if len(xs) else np.zeros((0, 2))
         steps = (a + (b - a) * np.linspace(0, 1, 48)[:, None] for a, b in pairwise(at))
@@ -46,7 +47,7 @@ def place(ax, labels: list[tuple], hints: list[tuple], drawn: list[tuple], dots:
         words.set_in_layout(False)
         box = words.get_window_extent(pen)
         half, here = np.array([box.width, box.height]) / 2, ax.transData.transform((x, y))
-        best = None
+        best = np.inf, here, here, here, 0
         for reach in (5, 9) if extra else (5, 9, 14, 20, 28, 38, 50, 64, 80):
             for angle in np.arange(0, 2 * np.pi, np.pi / 8):
                 middle = here + np.array([np.cos(angle), np.sin(angle)]) * (reach * dot + half)
@@ -55,7 +56,7 @@ def place(ax, labels: list[tuple], hints: list[tuple], drawn: list[tuple], dots:
                 cost += 4 * ((dots > low - 3 * dot) & (dots < high + 3 * dot)).all(1).sum()
                 cost += 0.12 * ((busy > low) & (busy < high)).all(1).sum()
                 cost += 50 * ((low < inside.p0).any() or (high > inside.p1).any())
-                if best is None or cost < best[0]:
+                if cost < best[0]:
                     best = cost, middle, low, high, reach
         cost, middle, low, high, reach = best
         if extra and cost > 3:

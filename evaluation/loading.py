@@ -41,9 +41,8 @@ def load_inputs(seq: Sequence, indices: Indices[int], has_depth: bool, size: int
     views = load_views(seq, indices, has_depth)
     if has_depth or by == 1:
         return shrink(views, by)
-    nothing = replace(views, depth=torch.full_like(views.alpha, torch.inf), flow=views.alpha.new_zeros(()))
-    nothing.flow = nothing.flow.expand(*views.alpha.shape, 4)
-    return without_depth(shrink(nothing, by))
+    still = views.alpha.new_zeros(()).expand(*views.alpha.shape, 4)
+    return without_depth(shrink(replace(views, depth=torch.full_like(views.alpha, torch.inf), flow=still), by))
 
 
 def load_truth(seq: Sequence, targets: Indices[int], novel: Indices[int], size: int | None = None) -> Truth:

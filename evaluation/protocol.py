@@ -53,7 +53,7 @@ def inputs(seq: Sequence, setup: str) -> list[int]:
     elif setup.startswith("views"):
         wanted = [(f, f"random{i}", "random") for f, i in spread(frames, int(setup[6:]))]
     else:
-        shots = {"canonical": rigs.canonical, **rigs.SETUPS}[setup](frames)
+        shots = (rigs.canonical if setup == "canonical" else rigs.SETUPS[setup])(frames, 0)
         wanted = [(s.frame, s.camera, "canonical") for s in shots]
     place = {(v.frame, v.camera, v.rig): i for i, v in enumerate(seq.views)}
     lacking = [w for w in wanted if w not in place]

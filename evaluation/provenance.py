@@ -95,7 +95,7 @@ def usable_cores() -> int:
 
 def versions() -> dict:
     """Versions of what has a say in the figures."""
-    out = {"python": platform.python_version()}
+    out: dict[str, str | None] = {"python": platform.python_version()}
     for package in ("timesplat", "torch", "numpy", "numba", "bpy", "usd-core"):
         try:
             out[package] = version(package)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from collections.abc import Sequence as Indices
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -73,8 +74,8 @@ def main(argv: list[str] | None = None) -> int:
             sub.add_argument("--size", type=int, default=128, help="pixels, by averaging (default: 128)")
             sub.add_argument("--jobs", type=int, default=1, help="processes, one core each (default: 1)")
             sub.add_argument("--device", default="cpu", help="where methods run: cpu or cuda (default: cpu)")
-        for words, options in arguments:
-            sub.add_argument(words, **options)
+        for words, how in arguments:
+            sub.add_argument(words, **how)
     args = p.parse_args(argv)
     run, default = args.run, STUDIES[args.study][2]
     try:
@@ -123,7 +124,7 @@ def subjects(folders: list[Path], size: int) -> dict[str, Sequence]:
 
 
 def scored(
-    options: StudyOptions, study: str, conditions: list, inputs: Callable, targets: Callable, step: int = 1
+    options: StudyOptions, study: str, conditions: Indices, inputs: Callable, targets: Callable, step: int = 1
 ) -> dict:
     """Every method on every object in every condition -> {(condition, label): [scores per object]}.
     inputs(seq, condition) and targets(seq, condition) give indices of views. step: the inputs are of every step-th
@@ -135,7 +136,7 @@ def scored(
     return scored_parts(options, study, conditions, parts, step=step)
 
 
-def scored_parts(options: StudyOptions, study: str, conditions: list, parts: Callable, **how) -> dict:
+def scored_parts(options: StudyOptions, study: str, conditions: Indices, parts: Callable, **how) -> dict:
     """The same where parts(seq, condition) gives [(inputs, targets)], each reconstructed alone, whose scores are
     joined. how: `still` or `step` of a Run."""
     labels: list[tuple] = []
@@ -146,7 +147,7 @@ def scored_parts(options: StudyOptions, study: str, conditions: list, parts: Cal
                 for m in options.methods:
                     labels.append((c, m.label, name))
                     runs.append(
-                        Run(name, seq.root, m, tuple(chosen), tuple(held_out), options.size, {"study": study}, **how)
+                        Run(name, seq.folder, m, tuple(chosen), tuple(held_out), options.size, {"study": study}, **how)
                     )
     rows = run_all(runs, Cache(options.out), Conditions(jobs=options.jobs, device=options.device), study)
     joined: dict[tuple, dict[str, list]] = {}
@@ -219,7 +220,9 @@ def training(options: StudyOptions) -> None:
     fig, axes = panels(2, width=4.8, height=3.6)
     seconds = "CPU-seconds"
     for n, (name, logs) in enumerate(runs.items()):
-        step, spent, psnr = [], [], []
+        step: list[int] = []
+        spent: list[float] = []
+        psnr: list[float] = []
         for log in logs:  # the stages of a run, one after the other
             s0, c0 = (step[-1], spent[-1]) if step else (0, 0.0)
             step += [s0 + x["step"] for x in log]
@@ -421,7 +424,7 @@ SETUP = {"default": "alternating", "help": f"input views: {protocol.FORMS} (defa
 COLUMNS = {"type": int, "default": 6, "help": "frames to show (default: 6)"}
 
 # study -> function, its own arguments, its methods by default (None: it takes no Sequences)
-STUDIES = {
+STUDIES: dict[str, tuple[Callable, list[tuple[str, dict]], str | None]] = {
     "training": (training, [("runs", RUN), ("--window", WINDOW)], None),
     "views": (views, [("--counts", COUNTS)], METHODS),
     "views-per-frame": (views_per_frame, [], "gs-lrm-frame,sweep,predicted"),

@@ -10,7 +10,7 @@ from .evaluated import READ
 
 FOLLOW = """
 display, parenting = part("addon.asset.display"), part("addon.asset.parenting")
-asset = part("model.asset").read_ply(sys.argv[1])
+asset = part("model.io.asset").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene, told = bpy.context.scene, {}
 def made(name, parent=None):

@@ -17,7 +17,7 @@ import atexit
 part("addon").register()
 atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
 display, sliders, edit, holding = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit", "asset_object"))
-asset = part("model.asset")
+asset = part("model.io.asset")
 folder = sys.argv[1] + os.sep
 ob = display.add_asset(asset.read_ply(folder + "in.ply"), "Walk. 1")
 scene = bpy.context.scene

@@ -116,7 +116,7 @@ for key in ["worker", "direct"] if find("pxr") else ["worker"]:
     os.environ["TIMESPLAT_PYTHON"] = named if key == "worker" else "/nowhere/python"
     result[key] = load(filepath=sys.argv[1])
     got, _ = importer.read_asset([Path(sys.argv[1])], fps=24, frame_start=1)
-    part("model.asset").write_ply(sys.argv[3] + key + ".ply", got.asset)
+    part("model.io.asset").write_ply(sys.argv[3] + key + ".ply", got.asset)
     result[key + "_bad"] = load(filepath=sys.argv[2])
     result[key + "_none"] = load(filepath=sys.argv[2] + "c.usdc")
 os.environ["TIMESPLAT_PYTHON"] = named

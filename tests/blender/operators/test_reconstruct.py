@@ -149,7 +149,7 @@ def test_what_cannot_be_done_is_said(installed, tmp_path):
 
 MEANWHILE = """
 part("addon").register()
-reconstruct, model, jobs = part("addon.operators.reconstruct"), part("model.asset"), part("addon.runtime.jobs")
+reconstruct, model, jobs = part("addon.operators.reconstruct"), part("model.io.asset"), part("addon.runtime.jobs")
 Vector = part("addon.operators.reconstruct").Matrix.Translation
 begun, results = [], {}
 jobs.start = lambda label, stages, finish, *rest, **named: begun.append(finish)

@@ -10,7 +10,7 @@ import types
 display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
 result_panel = part("addon.ui.result_panel")
 bpy.ops.wm.read_factory_settings(use_empty=True)
-ob = display.add_asset(part("model.asset").read_ply(sys.argv[1]), "a")
+ob = display.add_asset(part("model.io.asset").read_ply(sys.argv[1]), "a")
 drawn, buttons, labels = {}, [], []
 class Layout:
     def row(self, **_): return self
