@@ -10,12 +10,73 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FLOORS = ("datagen", "model", "addon", "evaluation")
-FILES = sorted([*ROOT.glob("*.py"), *(f for floor in FLOORS for f in (ROOT / floor).rglob("*.py"))])
+WINGS = ("datagen", "model", "addon", "evaluation", "benchmarks")
+FILES = sorted([*ROOT.glob("*.py"), *(f for wing in WINGS for f in (ROOT / wing).rglob("*.py"))])
 NAMES = [f.relative_to(ROOT).as_posix() for f in FILES]
 TORCH_FREE = ("datagen/", "addon/", "model/io/")
 BENCHMARKS = sorted(f.stem for f in (ROOT / "benchmarks").glob("*.py") if f.stem != "blender_display")
 TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
+
+# The layers of each wing, lowest first: a room may use those of its own layer and below. (Rooms beside one another are
+# kept apart by `test_no_circle`.) A name stands for the room and all that is in it.
+LAYERS = {
+    "model": (
+        ("model.io",),
+        ("model.parallel", "model.rotations", "model.devices"),
+        ("model.gaussians", "model.views"),
+        ("model.rasterize",),
+        ("model.geometry",),
+        ("model.network", "model.hexplane"),
+        ("model.checkpoints_io",),
+        ("model.fitting",),
+        ("model.methods",),
+        ("model.reconstruct",),
+        ("model.selftest",),
+        ("model.worker",),
+    ),
+    "evaluation": (
+        ("evaluation.provenance", "evaluation.protocol", "evaluation.image_quality", "evaluation.pictures"),
+        ("evaluation.flip", "evaluation.lpips", "evaluation.paper", "evaluation.figures", "evaluation.labels"),
+        ("evaluation.loading", "evaluation.method_spec", "evaluation.cache"),
+        ("evaluation.metrics",),
+        ("evaluation.scoring",),
+        ("evaluation.runner",),
+        ("evaluation.tables", "evaluation.bench_summary", "evaluation.charts"),
+        (
+            "evaluation.evaluate",
+            "evaluation.bench",
+            "evaluation.demo",
+            "evaluation.ablations",
+            "evaluation.differences",
+        ),
+        ("evaluation.studies", "evaluation.contact_sheet"),
+    ),
+    "addon": (
+        ("addon.asset",),
+        ("addon.runtime",),
+        ("addon.settings",),
+        ("addon.estimates",),
+        ("addon.operators",),
+        ("addon.ui",),
+        ("addon.command_line", "addon.package"),
+        ("addon",),
+    ),
+    "datagen": (
+        ("datagen.image_files", "datagen.rigs"),
+        ("datagen.sequence",),
+        ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
+        ("datagen.render_setup",),
+        ("datagen.capture",),
+        ("datagen.render_asset", "datagen.farm"),
+    ),
+}
+# What the product, all of `model` but these, does not know; they may use every layer up to the one named.
+ASIDE = {"model.baselines": "model.methods", "model.training": "model.checkpoints_io"}
+
+
+def room_of(name: str) -> str:
+    """The room of a file: "model/io/ply.py" -> "model.io.ply"."""
+    return name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
 def imports(name: str) -> set[str]:
@@ -26,10 +87,11 @@ def imports(name: str) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom):
-            if node.level == 0:
+            words = node.module.split(".") if node.module else []
+            if node.level == 0 and words[0] != "timesplat":
                 found.add(node.module)
                 continue
-            base = package[: len(package) - node.level + 1] + (node.module.split(".") if node.module else [])
+            base = package[: len(package) - node.level + 1] + words if node.level else words[1:]
             for alias in node.names:
                 room = ROOT.joinpath(*base, alias.name)
                 inside = room.with_suffix(".py").exists() or (room / "__init__.py").exists()
@@ -42,6 +104,18 @@ def rooms(name: str) -> set[str]:
     return {m[1:] for m in imports(name) if m.startswith(".") and m != "."}
 
 
+def within(room: str, place: str) -> bool:
+    """Whether a room is a place or in it."""
+    return room == place or room.startswith(place + ".")
+
+
+def layer(room: str) -> int:
+    """The number of the layer of its wing that a room is in, by the longest name that fits."""
+    fitting = [(len(p), i) for i, places in enumerate(LAYERS[room.split(".")[0]]) for p in places if within(room, p)]
+    assert fitting, f"{room} is in no layer; give it a place in LAYERS"
+    return max(fitting)[1]
+
+
 def test_the_walker_sees_what_it_should():
     assert "model.io.asset" in rooms("addon/asset/display.py") and "torch" in imports("model/gaussians.py")
     assert {"addon.asset.display", "addon.settings", "datagen.sequence"} <= rooms("addon/operators/reconstruct.py")
@@ -49,52 +123,51 @@ def test_the_walker_sees_what_it_should():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_floors(name):
-    floor, told = name.split("/")[0], rooms(name)
-    if floor == "datagen":
-        assert all(r.split(".")[0] == "datagen" for r in told)
-    if floor == "model":
-        others = {r for r in told if not r.startswith("model")}
-        assert others <= {"datagen.sequence", "datagen.rigs"}
-    if floor == "addon":
-        others = {r for r in told if not r.startswith(("addon", "datagen."))}
-        assert all(r.startswith("model.io") for r in others)
-    if floor not in ("cli.py", "evaluation"):
-        assert not any(r.split(".")[0] == "evaluation" for r in told), "nobody but the command line imports evaluation"
-    if floor != "addon" and name != "__init__.py":
+def test_wings(name):
+    wing, told = name.split("/")[0], rooms(name)
+    if wing == "datagen":
+        assert all(within(r, "datagen") for r in told)
+    if wing == "model":
+        assert {r for r in told if not within(r, "model")} <= {"datagen.sequence", "datagen.rigs"}
+    if wing == "addon":
+        others = {r for r in told if not within(r, "addon") and not within(r, "datagen")}
+        assert all(within(r, "model.io") for r in others)
+    if wing not in ("cli.py", "evaluation", "benchmarks"):
+        assert not any(within(r, w) for r in told for w in ("evaluation", "benchmarks")), "only cli imports side wings"
+    if wing != "addon" and name not in ("__init__.py", "benchmarks/blender_display.py"):
         told -= {"addon.package"} if name == "cli.py" else set()  # builds the .zip, without bpy
-        assert not any(r.split(".")[0] == "addon" for r in told), "nobody imports the add-on"
+        assert not any(within(r, "addon") for r in told), "nobody imports the add-on"
 
 
-ADDON = [n for n in NAMES if n.startswith("addon/")]
-# Storeys of the top floor, lowest first: each may use those below it, and its own rooms where that closes no circle.
-STOREYS = ("asset", "runtime", "settings", "estimates", "operators", "ui")
-ATTIC = ("", "command_line")  # `addon` itself, which registers all of them, and the command line
+@pytest.mark.parametrize("name", [n for n in NAMES if n.split("/")[0] in LAYERS])
+def test_layers(name):
+    room = room_of(name)
+    wing = room.split(".")[0]
+    inside = {r for r in rooms(name) if within(r, wing)}
+    apart = next((place for place in ASIDE if within(room, place)), None)
+    if apart:
+        assert all(within(r, apart) or layer(r) <= layer(ASIDE[apart]) for r in inside)
+    elif room != wing or wing == "addon":  # a package's face imports nothing else
+        assert not any(within(r, place) for r in inside for place in ASIDE), (
+            "the product knows no baseline, no training"
+        )
+        above = {r for r in inside - {wing} if layer(r) > layer(room)}
+        assert not above, f"{room} reaches up to {above}"
 
 
-@pytest.mark.parametrize("name", ADDON)
-def test_storeys_of_the_addon(name):
-    def storey(room: str) -> int:
-        first = room.split(".")[1] if "." in room else ""
-        return len(STOREYS) if first in ATTIC else STOREYS.index(first)
-
-    room = name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    if room != "addon.package":  # it runs without Blender, and nobody needs it there
-        assert all(storey(r) <= storey(room) for r in rooms(name) if r.startswith("addon"))
-
-
-def test_no_circle_in_the_addon():
-    """Imports inside functions included."""
-    left = {n.removesuffix(".py").removesuffix("/__init__").replace("/", "."): rooms(n) - {"addon"} for n in ADDON}
+def test_no_circle():
+    """Of imports, those inside functions included. That a room lies in a package does not count."""
+    left = {room_of(n): rooms(n) - {room_of(n)} for n in NAMES if n != "__init__.py"}
     while free := [room for room, needs in left.items() if not needs & left.keys()]:
         left = {room: needs for room, needs in left.items() if room not in free}
-    assert left == {}
+    assert left == {}, {room: needs & left.keys() for room, needs in left.items()}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_torch_near_blender_and_no_blender_near_torch(name):
     top = {m.split(".")[0] for m in imports(name) if not m.startswith(".")}
-    assert "timesplat" not in top, "inside the package imports are relative"
+    if not name.startswith("benchmarks/"):  # these run as scripts as well
+        assert "timesplat" not in top, "inside the package imports are relative"
     if name.startswith(TORCH_FREE):
         assert not top & TENSORS
     if name.startswith("model/"):
