@@ -9,7 +9,6 @@ training (section 4.1, appendix) is `--preset large --sampling paper --warmup 20
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -30,6 +29,7 @@ from ..network import PRESETS, Config, Network, load_matching
 from ..reconstruct import check_device, geometry_for, load_network, save_network
 from ..views import Views
 from . import distributed
+from .config import TrainConfig
 from .dataset import Clips, Sample
 from .deferred import Cut
 from .losses import geometric, load_perceptual, photometric
@@ -42,79 +42,74 @@ PATIENCE = 100  # steps in a row that may change nothing
 STAGES = ("data", "geometry", "network", "raster")  # what a step's time is spent on
 
 
-def run(args: argparse.Namespace) -> int:
-    """Trains as the arguments of `timesplat train` say (see cli.py); returns 0."""
-    if not 0 < args.rate < math.inf:
-        raise InputError(f"--rate {args.rate:g}: give a number above 0.")
-    check_device(args.device)
-    args.device = distributed.start(args.device)
+def train(config: TrainConfig) -> None:
+    """Trains to the end; under torchrun as one of several processes. Raises InputError for data, devices and run
+    folders that cannot be used, KeyboardInterrupt once an interrupted run is saved."""
+    check_device(config.device)
+    config = replace(config, device=distributed.start(config.device))
     try:
-        clips = load_clips(args)
+        clips = load_clips(config)
         if not distributed.rank():
             print(clips)
-        Trainer(make_network(args).to(args.device), clips, args).run()
+        Trainer(make_network(config).to(config.device), clips, config).run()
     finally:
         distributed.end()
-    return 0
 
 
-def load_clips(args: argparse.Namespace) -> Clips:
-    """The clips; one process packs, the others then find them packed."""
+def load_clips(config: TrainConfig) -> Clips:
+    """The clips; one process packs, the others then find them packed. Raises InputError."""
     if distributed.rank():
         distributed.wait()
-    passes = network_config(args).source == "given" or args.geometric > 0
-    clips = Clips(args.data, args.cache, args.shrink, args.sampling, args.mix, passes)
+    passes = network_config(config).source == "given" or config.geometric > 0
+    clips = Clips(config.data, config.cache, config.shrink, config.sampling, config.mix, passes)
     if not distributed.rank():
         distributed.wait()
     return clips
 
 
-def network_config(args: argparse.Namespace) -> Config:
+def network_config(config: TrainConfig) -> Config:
     """That of the preset, changed in what options were given. Raises InputError where they do not go together."""
-    options = {k: getattr(args, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
-    return replace(PRESETS[args.preset], **{k: v for k, v in options.items() if v is not None})
+    options = {k: getattr(config, k) for k in ("head", "source", "depth_range", "time", "free", "motion")}
+    return replace(PRESETS[config.preset], **{k: v for k, v in options.items() if v is not None})
 
 
-def make_network(args: argparse.Namespace) -> Network:
-    """With random weights by the seed, or those of --init."""
-    config = network_config(args)
-    if config.motion == "hexplane" and args.geometric:
-        raise InputError("--geometric compares velocities, and a HexPlane has none; leave it out.")
-    torch.manual_seed(args.seed)
-    network = Network(config)
-    if args.init:
-        load_matching(network, load_network(args.init))
+def make_network(config: TrainConfig) -> Network:
+    """With random weights by the seed, or those of --init. Raises InputError where these are another network's."""
+    torch.manual_seed(config.seed)
+    network = Network(network_config(config))
+    if config.init:
+        load_matching(network, load_network(config.init))
     return network
 
 
 class Trainer:
     """The state of a run: network, average, optimisers, and how far it has come."""
 
-    def __init__(self, network: Network, clips: Clips, args: argparse.Namespace):
-        self.network, self.clips, self.args = network, clips, args
-        network.checkpointing = args.checkpointing
+    def __init__(self, network: Network, clips: Clips, config: TrainConfig):
+        self.network, self.clips, self.config = network, clips, config
+        network.checkpointing = config.checkpointing
         self.views, self.targets = (
-            a or b for a, b in zip((args.views, args.targets), VIEWS[args.sampling], strict=True)
+            a or b for a, b in zip((config.views, config.targets), VIEWS[config.sampling], strict=True)
         )
-        self.perceptual = load_perceptual() if args.perceptual else None
+        self.perceptual = load_perceptual() if config.perceptual else None
         if self.perceptual:
-            self.perceptual.to(args.device)
+            self.perceptual.to(config.device)
         self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-        self.optimisers = make_optimisers(network, args.optimiser)
+        self.optimisers = make_optimisers(network, config.optimizer)
         self.step, self.seconds, self.cpu = 0, 0.0, 0.0
         self.skipped, self.bad = 0, 0  # steps whose gradient was not sound; samples whose loss was not finite
         self.learnt, self.idle = False, 0  # whether the last step changed anything; those in a row that did not
         self.stopped = False
-        self.state = args.out / "state.pt"
-        args.out.mkdir(parents=True, exist_ok=True)
+        self.state = config.out / "state.pt"
+        config.out.mkdir(parents=True, exist_ok=True)
         if self.state.exists():
             self.resume()
 
     def progress(self) -> float:
         """0..1, by the clock where minutes are given, else by steps."""
-        if self.args.minutes:
-            return max(self.seconds / (60 * self.args.minutes), self.step / self.args.steps)
-        return self.step / self.args.steps
+        if self.config.minutes:
+            return max(self.seconds / (60 * self.config.minutes), self.step / self.config.steps)
+        return self.step / self.config.steps
 
     def run(self) -> None:
         """Trains to the end; an interrupt (Ctrl-C) ends it after the step at hand, with the state saved. Raises
@@ -128,16 +123,16 @@ class Trainer:
             raise KeyboardInterrupt
 
     def _loop(self) -> None:
-        args, wall, cpu = self.args, self.seconds - time.perf_counter(), self.cpu - time.process_time()
+        config, wall, cpu = self.config, self.seconds - time.perf_counter(), self.cpu - time.process_time()
         layout = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
         quiet = True if distributed.rank() else None
         recent: list[tuple[float, float]] = []
         shares, due = np.zeros(len(STAGES)), False
-        with tqdm(total=1.0, disable=quiet, bar_format=layout, desc=args.out.name) as bar:
+        with tqdm(total=1.0, disable=quiet, bar_format=layout, desc=config.out.name) as bar:
             while self.progress() < 1 and not self.stopped:
                 recent.append(self.train_step(shares))
                 told = [wall + time.perf_counter(), self.stopped, self.learnt]
-                seconds, stopped, learnt = distributed.greatest(told, args.device)
+                seconds, stopped, learnt = distributed.greatest(told, config.device)
                 self.seconds, self.stopped, self.cpu = seconds, bool(stopped), cpu + time.process_time()
                 self.idle = 0 if learnt else self.idle + 1
                 if self.step % REPORT == 0:
@@ -161,24 +156,24 @@ class Trainer:
         """What ends a run that is past help; nothing was saved since it was not."""
         kept = "; it goes on from its last good state" if self.state.exists() else ""
         return InputError(
-            f"{self.args.out}: training ran away at step {self.step} ({how}){kept}; "
-            f"give a lower --rate than {self.args.rate:g}."
+            f"{self.config.out}: training ran away at step {self.step} ({how}){kept}; "
+            f"give a lower --rate than {self.config.rate:g}."
         )
 
     def report(self, recent: list[tuple[float, float]], shares: np.ndarray) -> dict:
         """A line of the log: means since the last one; seconds by the clock and of processor time (under load only
         the latter compares) since the start of the run; memory in MB, the highest so far."""
         loss, psnr = np.mean([r for r in recent if math.isfinite(r[0])] or [(math.nan, math.nan)], axis=0)
-        samples = len(recent) * self.args.accumulate * distributed.size()
+        samples = len(recent) * self.config.accumulate * distributed.size()
         line = {"step": self.step, "seconds": round(self.seconds, 1), "cpu_seconds": round(self.cpu, 1)}
         line |= {"loss": round(float(loss), 5), "psnr": round(float(psnr), 3)}
         line |= {"samples_per_s": round(samples / max(shares.sum(), 1e-9), 2), "memory": peak_memory()}
-        if self.args.device.startswith("cuda"):
-            line["cuda_memory"] = round(torch.cuda.max_memory_allocated(self.args.device) / 2**20)
+        if self.config.device.startswith("cuda"):
+            line["cuda_memory"] = round(torch.cuda.max_memory_allocated(self.config.device) / 2**20)
         line |= {"skipped": self.skipped, "bad": self.bad}
         line["share"] = dict(zip(STAGES, (shares / shares.sum()).round(2).tolist(), strict=True))
         if not distributed.rank():
-            with open(self.args.out / "log.jsonl", "a") as f:
+            with open(self.config.out / "log.jsonl", "a") as f:
                 f.write(json.dumps(line) + "\n")
         return line
 
@@ -186,11 +181,11 @@ class Trainer:
         """One optimiser step over `accumulate` samples -> mean loss and PSNR of the targets, NaN if all were bad.
         Samples are seeded by the step and their number in it, over all processes: a resumed run draws what an
         unbroken one would have, and two processes what one with twice the samples would."""
-        args = self.args
+        config = self.config
         self.network.train()
         results = []
-        for n in range(args.accumulate):
-            rng = np.random.default_rng((args.seed, self.step, distributed.rank() * args.accumulate + n))
+        for n in range(config.accumulate):
+            rng = np.random.default_rng((config.seed, self.step, distributed.rank() * config.accumulate + n))
             clock = [self.now()]
             sample = self.clips.sample(rng, self.targets, self.views)
             clock.append(self.now())
@@ -198,8 +193,8 @@ class Trainer:
             data, geometry, forward, raster, backward = np.diff(clock)
             shares += [data, geometry, forward + backward, raster]
         distributed.average_gradients(self.network)
-        rate = learning_rate(args.rate, self.step, args.warmup, self.progress())
-        stepped = take_step(self.optimisers, rate, warm=self.step >= args.warmup)
+        rate = learning_rate(config.rate, self.step, config.warmup, self.progress())
+        stepped = take_step(self.optimisers, rate, warm=self.step >= config.warmup)
         self.skipped += not stepped
         self.step += 1
         if not sound_weights(self.network):
@@ -215,25 +210,25 @@ class Trainer:
     def learn(self, sample: Sample, rng: np.random.Generator, clock: list[float]) -> tuple[float, float] | None:
         """Adds a sample's gradients to the network's. Returns its loss and the PSNR of its targets; None, and no
         gradients, where the loss is not finite. Appends the times at which stages ended to the clock."""
-        args, network = self.args, self.network
+        config, network = self.config, self.network
         geometry = geometry_for(network.config.source, sample.inputs)
         truth = None
-        if args.geometric and network.config.source != "given":
-            truth = [x.to(args.device) for x in self.pixel_truth(sample.inputs, geometry)]
-        inputs, targets = sample.inputs.to(args.device), sample.targets.to(args.device)
-        geometry = geometry and geometry.to(args.device)
+        if config.geometric and network.config.source != "given":
+            truth = [x.to(config.device) for x in self.pixel_truth(sample.inputs, geometry)]
+        inputs, targets = sample.inputs.to(config.device), sample.targets.to(config.device)
+        geometry = geometry and geometry.to(config.device)
         clock.append(self.now())
-        with torch.autocast(args.device.split(":")[0], torch.bfloat16, enabled=args.bf16):
+        with torch.autocast(config.device.split(":")[0], torch.bfloat16, enabled=config.bf16):
             g = network(inputs, geometry)
         more = self.scene_loss(g, truth)
         clock.append(self.now())
         colour = rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.ones(3)
-        background = torch.tensor(colour).float().to(args.device)
+        background = torch.tensor(colour).float().to(config.device)
 
         def picture_loss(rgb: Tensor, alpha: Tensor, few: Views) -> Tensor:
             loss = photometric(rgb, alpha, few, background)
             if self.perceptual:
-                loss = loss + args.perceptual * self.perceptual(rgb, few.over(background))
+                loss = loss + config.perceptual * self.perceptual(rgb, few.over(background))
             return loss
 
         cut = Cut(g)
@@ -241,13 +236,13 @@ class Trainer:
         loss += 0.0 if more is None else float(more.detach())
         clock.append(self.now())
         if math.isfinite(loss):
-            cut.backward(1 / args.accumulate, more)
+            cut.backward(1 / config.accumulate, more)
         clock.append(self.now())
         return (loss, psnr) if math.isfinite(loss) else None
 
     def now(self) -> float:
         """Seconds, once the device has done what it was given."""
-        if self.args.device.startswith("cuda"):
+        if self.config.device.startswith("cuda"):
             torch.cuda.synchronize()
         return time.perf_counter()
 
@@ -256,10 +251,10 @@ class Trainer:
         no more opaque than they need to (mean opacity)."""
         more = None
         if truth is not None:
-            weight = self.args.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
+            weight = self.config.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
             more = weight * geometric(g[: len(truth[0])], *truth)  # free Gaussians come last
-        if self.args.opacity:
-            more = self.args.opacity * g.opacity.mean() + (0.0 if more is None else more)
+        if self.config.opacity:
+            more = self.config.opacity * g.opacity.mean() + (0.0 if more is None else more)
         return more
 
     def pixel_truth(self, inputs, geometry) -> tuple[torch.Tensor, Gaussians4D, torch.Tensor]:
@@ -293,12 +288,12 @@ class Trainer:
         os.replace(tmp, self.state)
         averaged = Network(self.network.config)
         averaged.load_state_dict(self.average)
-        notes = {"steps": str(self.step), "hours": f"{self.seconds / 3600:.2f}", "seed": str(self.args.seed)}
-        save_network(self.args.out / "network.safetensors", averaged, notes)
+        notes = {"steps": str(self.step), "hours": f"{self.seconds / 3600:.2f}", "seed": str(self.config.seed)}
+        save_network(self.config.out / "network.safetensors", averaged, notes)
 
     def resume(self) -> None:
         try:
-            state = torch.load(self.state, map_location=self.args.device, weights_only=True)
+            state = torch.load(self.state, map_location=self.config.device, weights_only=True)
             self.network.load_state_dict(state["network"])
             if not sound_weights(self.network):
                 raise ValueError("its weights are not finite")
