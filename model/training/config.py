@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from ...datagen.sequence import InputError
+from .clip_groups import parse_mix
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class TrainConfig:
         for name in ("steps", "shrink", "accumulate"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name} {getattr(self, name)}: give a whole number above 0.")
+        parse_mix(self.mix)
         for field in fields(self):
             value, words = getattr(self, field.name), choices(field.name)
             if words and value not in (*words, field.default):

@@ -27,14 +27,14 @@ from ..gaussians import Gaussians4D
 from ..geometry.lift import lift_geometry
 from ..network import PRESETS, Config, Network, load_matching
 from ..reconstruct import check_device, geometry_for, load_network, save_network
-from ..views import Views
+from ..views import BACKGROUND, Views
 from . import distributed
 from .config import TrainConfig
-from .dataset import Clips, Sample
+from .dataset import ClipDataset, Sample
 from .deferred import Cut
 from .losses import geometric, load_perceptual, photometric
 from .optimizers import learning_rate, make_optimisers, sound_weights, take_step
-from .view_sampling import VIEWS
+from .view_sampling import DEFAULT_COUNTS
 
 EMA = 0.998  # per step; the shipped weights are this average
 REPORT = 20  # steps between two lines of the log
@@ -56,12 +56,12 @@ def train(config: TrainConfig) -> None:
         distributed.end()
 
 
-def load_clips(config: TrainConfig) -> Clips:
+def load_clips(config: TrainConfig) -> ClipDataset:
     """The clips; one process packs, the others then find them packed. Raises InputError."""
     if distributed.rank():
         distributed.wait()
-    passes = network_config(config).source == "given" or config.geometric > 0
-    clips = Clips(config.data, config.cache, config.shrink, config.sampling, config.mix, passes)
+    has_depth = network_config(config).source == "given" or config.geometric > 0
+    clips = ClipDataset(config.data, config.cache, config.shrink, config.sampling, config.mix, has_depth)
     if not distributed.rank():
         distributed.wait()
     return clips
@@ -85,11 +85,11 @@ def make_network(config: TrainConfig) -> Network:
 class Trainer:
     """The state of a run: network, average, optimisers, and how far it has come."""
 
-    def __init__(self, network: Network, clips: Clips, config: TrainConfig):
+    def __init__(self, network: Network, clips: ClipDataset, config: TrainConfig):
         self.network, self.clips, self.config = network, clips, config
         network.checkpointing = config.checkpointing
         self.views, self.targets = (
-            a or b for a, b in zip((config.views, config.targets), VIEWS[config.sampling], strict=True)
+            a or b for a, b in zip((config.views, config.targets), DEFAULT_COUNTS[config.sampling], strict=True)
         )
         self.perceptual = load_perceptual() if config.perceptual else None
         if self.perceptual:
@@ -222,7 +222,7 @@ class Trainer:
             g = network(inputs, geometry)
         more = self.scene_loss(g, truth)
         clock.append(self.now())
-        colour = rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.ones(3)
+        colour = rng.uniform(0, 1, 3) if rng.random() < 0.5 else np.full(3, BACKGROUND)
         background = torch.tensor(colour).float().to(config.device)
 
         def picture_loss(rgb: Tensor, alpha: Tensor, few: Views) -> Tensor:

@@ -34,9 +34,9 @@ def test_options_fill_the_fields():
 
 def test_the_words_are_those_that_the_code_knows():
     from timesplat.model.network import PRESETS
-    from timesplat.model.training.view_sampling import VIEWS
+    from timesplat.model.training.view_sampling import SAMPLERS
 
-    assert set(choices("preset")) == set(PRESETS) and set(choices("sampling")) == set(VIEWS)
+    assert set(choices("preset")) == set(PRESETS) and set(choices("sampling")) == set(SAMPLERS)
     assert choices("rate") == choices("data") == ()
 
 
@@ -53,6 +53,7 @@ def test_a_rate_that_is_none_is_refused(rate):
         ({"shrink": -1}, "--shrink -1: give a whole number above 0."),
         ({"accumulate": 0}, "--accumulate 0: give a whole number above 0."),
         ({"preset": "tall"}, "--preset tall: choose one of tiny, small, base, large."),
+        ({"mix": "2:1"}, "--mix 2:1: not weights of hq4d:4d:3d; write 200:50:1, or uniform."),
         ({"depth_range": "near"}, "--depth-range near: choose one of paper, centred."),
         (
             {"motion": "hexplane", "geometric": 0.5},

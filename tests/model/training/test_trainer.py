@@ -12,7 +12,7 @@ import torch
 from timesplat.datagen.sequence import InputError
 from timesplat.model.network import PRESETS, Config, Network
 from timesplat.model.training.config import TrainConfig
-from timesplat.model.training.dataset import Clips
+from timesplat.model.training.dataset import ClipDataset
 from timesplat.model.training.optimizers import learning_rate, make_optimisers, take_step
 from timesplat.model.training.trainer import Trainer, make_network, network_config, train
 from timesplat.model.training.vgg import VGG
@@ -123,7 +123,7 @@ def trainer(sphere_folder, tmp_path):
 
     def make(**options) -> Trainer:
         config = make_config(sphere_folder.parent, tmp_path / "run", source="predicted", **options)
-        return Trainer(make_network(config), Clips(config.data, config.cache), config)
+        return Trainer(make_network(config), ClipDataset(config.data, config.cache), config)
 
     return make
 
