@@ -24,16 +24,15 @@ from tqdm import tqdm
 
 from ...datagen.sequence import InputError
 from ..gaussians import Gaussians4D
-from ..geometry.lift import lift_geometry
 from ..network import PRESETS, Config, Network, load_matching
 from ..reconstruct import check_device, geometry_for, load_network, save_network
 from ..views import BACKGROUND, Views
 from . import distributed
 from .config import TrainConfig
 from .dataset import ClipDataset, Sample
-from .deferred import Cut
-from .losses import geometric, load_perceptual, photometric
-from .optimizers import learning_rate, make_optimisers, sound_weights, take_step
+from .deferred import DetachedScene
+from .losses import PixelTruth, geometric_loss, load_perceptual_loss, photometric_loss, pixel_truth
+from .optimizers import clip_and_step, learning_rate, make_optimizers, weights_fit_checkpoint
 from .view_sampling import DEFAULT_COUNTS
 
 EMA = 0.998  # per step; the shipped weights are this average
@@ -59,11 +58,11 @@ def train(config: TrainConfig) -> None:
 def load_clips(config: TrainConfig) -> ClipDataset:
     """The clips; one process packs, the others then find them packed. Raises InputError."""
     if distributed.rank():
-        distributed.wait()
+        distributed.barrier()
     has_depth = network_config(config).source == "given" or config.geometric > 0
     clips = ClipDataset(config.data, config.cache, config.shrink, config.sampling, config.mix, has_depth)
     if not distributed.rank():
-        distributed.wait()
+        distributed.barrier()
     return clips
 
 
@@ -91,11 +90,11 @@ class Trainer:
         self.views, self.targets = (
             a or b for a, b in zip((config.views, config.targets), DEFAULT_COUNTS[config.sampling], strict=True)
         )
-        self.perceptual = load_perceptual() if config.perceptual else None
+        self.perceptual = load_perceptual_loss() if config.perceptual else None
         if self.perceptual:
             self.perceptual.to(config.device)
         self.average = {k: v.detach().clone() for k, v in network.state_dict().items()}
-        self.optimisers = make_optimisers(network, config.optimizer)
+        self.optimizers = make_optimizers(network, config.optimizer)
         self.step, self.seconds, self.cpu = 0, 0.0, 0.0
         self.skipped, self.bad = 0, 0  # steps whose gradient was not sound; samples whose loss was not finite
         self.learnt, self.idle = False, 0  # whether the last step changed anything; those in a row that did not
@@ -132,7 +131,7 @@ class Trainer:
             while self.progress() < 1 and not self.stopped:
                 recent.append(self.train_step(shares))
                 told = [wall + time.perf_counter(), self.stopped, self.learnt]
-                seconds, stopped, learnt = distributed.greatest(told, config.device)
+                seconds, stopped, learnt = distributed.reduce_max(told, config.device)
                 self.seconds, self.stopped, self.cpu = seconds, bool(stopped), cpu + time.process_time()
                 self.idle = 0 if learnt else self.idle + 1
                 if self.step % REPORT == 0:
@@ -164,7 +163,7 @@ class Trainer:
         """A line of the log: means since the last one; seconds by the clock and of processor time (under load only
         the latter compares) since the start of the run; memory in MB, the highest so far."""
         loss, psnr = np.mean([r for r in recent if math.isfinite(r[0])] or [(math.nan, math.nan)], axis=0)
-        samples = len(recent) * self.config.accumulate * distributed.size()
+        samples = len(recent) * self.config.accumulate * distributed.world_size()
         line = {"step": self.step, "seconds": round(self.seconds, 1), "cpu_seconds": round(self.cpu, 1)}
         line |= {"loss": round(float(loss), 5), "psnr": round(float(psnr), 3)}
         line |= {"samples_per_s": round(samples / max(shares.sum(), 1e-9), 2), "memory": peak_memory()}
@@ -194,10 +193,10 @@ class Trainer:
             shares += [data, geometry, forward + backward, raster]
         distributed.average_gradients(self.network)
         rate = learning_rate(config.rate, self.step, config.warmup, self.progress())
-        stepped = take_step(self.optimisers, rate, warm=self.step >= config.warmup)
+        stepped = clip_and_step(self.optimizers, rate, warmed_up=self.step >= config.warmup)
         self.skipped += not stepped
         self.step += 1
-        if not sound_weights(self.network):
+        if not weights_fit_checkpoint(self.network):
             raise self.ran_away("weights beyond what a checkpoint holds")
         decay = min(EMA, self.step / (self.step + 10))
         for k, v in self.network.state_dict().items():
@@ -214,7 +213,7 @@ class Trainer:
         geometry = geometry_for(network.config.source, sample.inputs)
         truth = None
         if config.geometric and network.config.source != "given":
-            truth = [x.to(config.device) for x in self.pixel_truth(sample.inputs, geometry)]
+            truth = pixel_truth(network, sample.inputs, geometry).to(config.device)
         inputs, targets = sample.inputs.to(config.device), sample.targets.to(config.device)
         geometry = geometry and geometry.to(config.device)
         clock.append(self.now())
@@ -226,17 +225,19 @@ class Trainer:
         background = torch.tensor(colour).float().to(config.device)
 
         def picture_loss(rgb: Tensor, alpha: Tensor, few: Views) -> Tensor:
-            loss = photometric(rgb, alpha, few, background)
+            loss = photometric_loss(rgb, alpha, few, background)
             if self.perceptual:
                 loss = loss + config.perceptual * self.perceptual(rgb, few.over(background))
             return loss
 
-        cut = Cut(g)
-        loss, psnr = cut.views_loss(targets, background, picture_loss) if cut.finite() else (math.nan, math.nan)
+        scene = DetachedScene(g)
+        loss, psnr = (
+            scene.backward_views(targets, background, picture_loss) if scene.is_finite() else (math.nan, math.nan)
+        )
         loss += 0.0 if more is None else float(more.detach())
         clock.append(self.now())
         if math.isfinite(loss):
-            cut.backward(1 / config.accumulate, more)
+            scene.backward_network(1 / config.accumulate, more)
         clock.append(self.now())
         return (loss, psnr) if math.isfinite(loss) else None
 
@@ -246,33 +247,16 @@ class Trainer:
             torch.cuda.synchronize()
         return time.perf_counter()
 
-    def scene_loss(self, g: Gaussians4D, truth) -> Tensor | None:
+    def scene_loss(self, g: Gaussians4D, truth: PixelTruth | None) -> Tensor | None:
         """What is asked of the Gaussians themselves: to be where depth has them (less and less of it), and to be
         no more opaque than they need to (mean opacity)."""
         more = None
         if truth is not None:
             weight = self.config.geometric * (1 - 0.9 * min(1, 2 * self.progress()))
-            more = weight * geometric(g[: len(truth[0])], *truth)  # free Gaussians come last
+            more = weight * geometric_loss(g[: len(truth)], truth)  # free Gaussians come last
         if self.config.opacity:
             more = self.config.opacity * g.opacity.mean() + (0.0 if more is None else more)
         return more
-
-    def pixel_truth(self, inputs, geometry) -> tuple[torch.Tensor, Gaussians4D, torch.Tensor]:
-        """For each of the network's Gaussians: the time of its view, what the lift of the renderer's depth says
-        of its pixel, and whether that is known."""
-        truth = lift_geometry(inputs)
-        if geometry is not None:
-            owner = geometry.owner
-        else:
-            row = self.network.rows(inputs, self.network.kept_patches(inputs))
-            kept = (row >= 0).nonzero()[:, 0]
-            owner = kept[torch.argsort(row[kept])]
-        view_time = inputs.time[:, None, None].expand_as(inputs.alpha).flatten()
-        away = (truth.gaussians.t - view_time[truth.owner]).abs()
-        order = torch.argsort(away, descending=True, stable=True)
-        piece = torch.full((len(view_time),), -1)
-        piece.numpy()[truth.owner[order].numpy()] = order.numpy()  # of a pixel's pieces the one of its own time
-        return view_time[owner], truth.gaussians[piece[owner]], piece[owner] >= 0
 
     def save(self) -> None:
         if distributed.rank():
@@ -280,7 +264,7 @@ class Trainer:
         state = {
             "network": self.network.state_dict(),
             "average": self.average,
-            "optimisers": [o.state_dict() for o in self.optimisers],
+            "optimisers": [o.state_dict() for o in self.optimizers],
             "progress": {k: getattr(self, k) for k in ("step", "seconds", "cpu", "skipped", "bad")},
         }
         tmp = self.state.with_suffix(".tmp")
@@ -295,11 +279,11 @@ class Trainer:
         try:
             state = torch.load(self.state, map_location=self.config.device, weights_only=True)
             self.network.load_state_dict(state["network"])
-            if not sound_weights(self.network):
+            if not weights_fit_checkpoint(self.network):
                 raise ValueError("its weights are not finite")
             self.average = state["average"]
-            for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
-                optimiser.load_state_dict(saved)
+            for optimizer, saved in zip(self.optimizers, state["optimisers"], strict=True):
+                optimizer.load_state_dict(saved)
         except Exception as e:
             raise InputError(f"{self.state}: this run cannot be resumed ({e}); choose another --out.") from None
         for k, v in state["progress"].items():

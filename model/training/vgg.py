@@ -22,7 +22,10 @@ from ...datagen.sequence import InputError
 
 CONVOLUTIONS = {16: (2, 2, 3, 3, 3), 19: (2, 2, 4, 4, 4)}  # by block; a pooling ends each
 CHANNELS = (64, 128, 256, 512, 512)
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the pictures that the weights were trained on
+IMAGENET_MEAN, IMAGENET_STD = (
+    (0.485, 0.456, 0.406),
+    (0.229, 0.224, 0.225),
+)  # of the pictures that the weights were trained on
 
 
 class VGG(nn.Module):
@@ -42,8 +45,8 @@ class VGG(nn.Module):
             self.names.append(f"pool{block}")
             layers.append(nn.MaxPool2d(2) if pool == "max" else nn.AvgPool2d(2))
         self.features = nn.Sequential(*layers)
-        self.register_buffer("mean", torch.tensor(MEAN)[:, None, None], persistent=False)
-        self.register_buffer("std", torch.tensor(STD)[:, None, None], persistent=False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
         self.eval().requires_grad_(False)
 
     def forward(self, x: Tensor, layers: list[str]) -> list[Tensor]:

@@ -13,7 +13,6 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model.network import PRESETS, Config, Network
 from timesplat.model.training.config import TrainConfig
 from timesplat.model.training.dataset import ClipDataset
-from timesplat.model.training.optimizers import learning_rate, make_optimisers, take_step
 from timesplat.model.training.trainer import Trainer, make_network, network_config, train
 from timesplat.model.training.vgg import VGG
 
@@ -147,44 +146,6 @@ def test_bad_samples_are_left_out_and_counted(trainer, monkeypatch):
     assert np.isnan(loss) and t.bad == 3
     for k, v in t.network.state_dict().items():
         assert torch.equal(v, after[k])
-
-
-@pytest.mark.parametrize("size,warm,steps", [(1e3, True, False), (1e3, False, True), (float("nan"), False, False)])
-def test_a_wild_gradient_changes_nothing(size, warm, steps):
-    network = torch.nn.Linear(2, 2)
-    network.blocks = torch.nn.ModuleList()
-    optimisers = make_optimisers(network, "adamw")
-    before = network.weight.clone()
-    network.weight.grad = torch.full((2, 2), size)
-    assert take_step(optimisers, 0.1, warm) == steps
-    assert torch.equal(network.weight, before) != steps and network.weight.grad is None
-
-
-def test_the_rate_warms_up_and_falls_to_zero():
-    assert learning_rate(1.0, 0, 100, 0.0) == pytest.approx(0.01)
-    assert learning_rate(1.0, 99, 100, 0.0) == pytest.approx(1)
-    assert learning_rate(1.0, 500, 100, 0.5) == pytest.approx(0.5)
-    assert learning_rate(1.0, 999, 100, 1.0) == pytest.approx(0)
-
-
-def test_muon_takes_the_matrices_of_the_blocks():
-    """Orthogonal steps for them, of about AdamW's size; everything else is AdamW's."""
-    network = Network(Config(width=32, depth=2, heads=2))
-    adamw, muon = make_optimisers(network, "muon")
-    (group,) = muon.param_groups
-    assert {p.data_ptr() for p in group["params"]} == {
-        p.data_ptr() for n, p in network.named_parameters() if n.startswith("blocks") and p.ndim == 2
-    }
-    assert sum(len(g["params"]) for g in [*adamw.param_groups, group]) == len(list(network.parameters()))
-    p = network.blocks[0].qkv.weight
-    before = p.detach().clone()
-    for q in network.parameters():
-        q.grad = torch.randn_like(q)
-    assert take_step([adamw, muon], 0.01, warm=False)
-    step = (p.detach() - before) / 0.01
-    assert float(step.square().mean().sqrt()) == pytest.approx(0.2, rel=0.3)
-    values = torch.linalg.svdvals(step)
-    assert values.max() / values.min() < 4
 
 
 def test_weights_that_run_away_stop_the_run_and_are_not_saved(sphere_folder, tmp_path):
