@@ -22,7 +22,8 @@ import torch
 
 from timesplat.model.network import Network
 from timesplat.model.training.config import TrainConfig, add_arguments
-from timesplat.model.training.trainer import STAGES, Trainer, load_clips, make_network
+from timesplat.model.training.reporting import STAGES
+from timesplat.model.training.trainer import Trainer, load_clips, make_network
 
 HEADER = ("network", "weights", "tokens", "steps/s", "CPU-s a step", *STAGES, "GFLOP", "floor, ms", "network is")
 
@@ -53,15 +54,16 @@ def measure(config: TrainConfig, steps: int) -> list[str]:
     trainer = Trainer(network, load_clips(config), config)
     tokens: list[int] = []
     network.blocks[0].register_forward_pre_hook(lambda module, inputs: tokens.append(len(inputs[0])))
-    trainer.train_step(np.zeros(len(STAGES)))
+    trainer.train_step()
     tokens.clear()
-    shares, wall, cpu = np.zeros(len(STAGES)), time.perf_counter(), time.process_time()
+    trainer.timer.reset()
+    wall, cpu = time.perf_counter(), time.process_time()
     for _ in range(steps):
-        trainer.train_step(shares)
+        trainer.train_step()
     wall, cpu = (time.perf_counter() - wall) / steps, (time.process_time() - cpu) / steps
     flops = step_flops(network, float(np.sqrt(np.mean(np.square(tokens)))), config.checkpointing)
     floor = flops / machine_rate(config.device, torch.bfloat16 if config.bf16 else torch.float32)
-    taken = shares[STAGES.index("network")] / steps
+    taken = trainer.timer.seconds["network"] / steps
     weights = sum(p.numel() for p in network.parameters())
     return [
         f"{config.preset}, {config.source}, {config.device}" + (", bf16" if config.bf16 else ""),
@@ -69,7 +71,7 @@ def measure(config: TrainConfig, steps: int) -> list[str]:
         f"{np.mean(tokens):.0f}",
         f"{1 / wall:.2f}",
         f"{cpu:.2f}",
-        *(f"{x:.0%}" for x in shares / shares.sum()),
+        *(f"{x:.0%}" for x in trainer.timer.fractions.values()),
         f"{flops / 1e9:.0f}",
         f"{1000 * floor:.0f}",
         f"{taken / floor:.1f} times that",
