@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The three groups of clips that training draws from by weight, as the paper's data has them (appendix, "Dataset
-Curation"): `hq4d` moves much, but not wildly; `4d` is all else that moves; `3d` are still objects, displaced or not.
+"""The groups of clips that training draws from by weight, as the paper's data has them (appendix, "Dataset Curation"):
+`hq4d` moves much, but not wildly; `4d` is all else that moves; `3d` are still objects, displaced or not.
 """
 
 from __future__ import annotations

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Deferred backpropagation through the rasteriser (Zhang et al. 2022; paper, appendix A.2).
-
-The loss is a mean over target views. So the views are drawn a few at a time, and the gradient of each few is taken
-to the Gaussians alone, which are detached from the network; one backward pass through the network follows. What the
-rasteriser keeps is that of a few views, and no view is drawn twice.
-"""
+"""Deferred backpropagation through the rasteriser (Zhang et al. 2022; paper, appendix A.2)."""
 
 from __future__ import annotations
 
@@ -22,8 +17,11 @@ VIEWS_AT_A_TIME = 4
 
 
 class DetachedScene:
-    """A scene on whose tensors gradients are gathered, a few views at a time, before one backward pass takes them on
-    into the network that made it."""
+    """A scene on whose tensors gradients are gathered before one backward pass takes them on into the network.
+
+    The loss is a mean over target views. So the views are drawn a few at a time, and the gradient of each few is taken
+    to the scene alone, which is detached from the network: what the rasteriser keeps is that of a few views, and no
+    view is drawn twice."""
 
     def __init__(self, scene: Moving):
         """scene: Gaussians4D, or another with a `map` over its tensors."""

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Several processes that train one network: `torchrun --nproc-per-node 2 -m timesplat.cli train …`.
-
-Each draws samples of its own, and the gradients are averaged after the backward pass, so that N processes do what
-one does with N times `--accumulate`. gloo between CPUs, NCCL between GPUs. Without torchrun all of it does nothing.
+"""Several processes that train one network: `torchrun --nproc-per-node 2 -m timesplat.cli train …`. N of them do what
+one does with N times `--accumulate`; without torchrun all of this does nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +13,8 @@ import torch.distributed as dist
 
 
 def start(device: str) -> str:
-    """Joins the processes that torchrun started; returns the device that this one is to use."""
+    """Joins the processes that torchrun started, by gloo between CPUs and NCCL between GPUs; returns the device that
+    this one is to use."""
     if "WORLD_SIZE" not in os.environ or dist.is_initialized():
         return device
     if device.startswith("cuda"):

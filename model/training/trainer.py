@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training of the network on rendered clips: `timesplat train DATA… --out RUN`.
-
-A RUN folder holds `log.jsonl` (a line per report), `state.pt` (all that an exact resume needs) and
-`network.safetensors` (the averaged weights, ready for `--checkpoint`). Calling it again goes on. The paper's own
-training (section 4.1, appendix) is `--preset large --sampling paper --warmup 2000 --bf16 --checkpointing
---accumulate N` under torchrun; what differs by default was better at the scale of one machine.
-"""
+"""Training of the network on rendered clips: `timesplat train DATA… --out RUN`."""
 
 from __future__ import annotations
 
@@ -50,8 +44,13 @@ INTERVALS = Intervals()
 
 
 def train(config: TrainConfig) -> None:
-    """Trains to the end; under torchrun as one of several processes. Raises InputError for data, devices and run
-    folders that cannot be used, KeyboardInterrupt once an interrupted run is saved."""
+    """Trains to the end, and goes on where the run folder stands; under torchrun as one of several processes.
+
+    The folder holds `log.jsonl` (a line per report), `state.pt` (all that an exact resume needs) and
+    `network.safetensors` (the averaged weights, ready for `--checkpoint`). The paper's own training (section 4.1,
+    appendix) is `--preset large --sampling paper --warmup 2000 --bf16 --checkpointing --accumulate N`; what differs by
+    default was better at the scale of one machine. Raises InputError for data, devices and run folders that cannot be
+    used, KeyboardInterrupt once an interrupted run is saved."""
     check_device(config.device)
     config = replace(config, device=distributed.start(config.device))
     try:

@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Features of VGG-16 and VGG-19 (Simonyan & Zisserman 2014) for perceptual losses and metrics.
-
-The layers are in the order of torchvision's `features`, so that its weight files fit:
-
-    path = find_weights("vgg16")                          # None where there is none
-    network = VGG(16).load(path)
-    maps = network(x, ["relu1_2", "relu2_2"])             # x (N,3,H,W) in 0..1 -> list of (N,C,h,w)
-
-Files are looked for in the folder that $TIMESPLAT_WEIGHTS names, then in torch's hub cache. None is fetched.
-"""
+"""Features of VGG-16 and VGG-19 (Simonyan & Zisserman 2014) for perceptual losses and metrics."""
 
 from __future__ import annotations
 
@@ -29,8 +20,9 @@ IMAGENET_MEAN, IMAGENET_STD = (
 
 
 class VGG(nn.Module):
-    """The convolutions of VGG-`depth` without gradients of their own, in evaluation mode. pool: "max" as trained,
-    or "average" as perceptual losses have it (smoother gradients)."""
+    """The convolutions of VGG-`depth` (16 or 19) without gradients of their own, in evaluation mode. The layers are in
+    the order of torchvision's `features`, so that its weight files fit. pool: "max" as trained, or "average" as
+    perceptual losses have it (smoother gradients)."""
 
     def __init__(self, depth: int, pool: str = "max"):
         super().__init__()
@@ -77,7 +69,7 @@ class VGG(nn.Module):
 
 def find_weights(name: str) -> Path | None:
     """The file `NAME.pth` or `NAME-*.pth` ("vgg16" finds vgg16-397923af.pth, not vgg16_bn-….pth) in the folder
-    $TIMESPLAT_WEIGHTS or in torch's hub cache; None where neither has one."""
+    $TIMESPLAT_WEIGHTS, else in torch's hub cache; None where neither has one. None is fetched."""
     folders = [Path(torch.hub.get_dir()) / "checkpoints"]
     if os.environ.get("TIMESPLAT_WEIGHTS"):
         folders.insert(0, Path(os.environ["TIMESPLAT_WEIGHTS"]))

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which views of a clip a training sample takes. Only numbers: no images are read here.
-
-setups  inputs as the paper's evaluation setups have them, targets among the other views (the default)
-paper   36 views at random; inputs and targets are drawn from them independently, so they may overlap (4.1)
-video   the four canonical views of the first frame and the front view of each frame (4.1, free Gaussians)
-static  inputs and targets at one frame, which may overlap: the object as if it never moved (GS-LRM)
-"""
+"""Which views of a clip a training sample takes. Only numbers: no images are read here."""
 
 from __future__ import annotations
 
@@ -42,8 +36,14 @@ class ClipLayout:
 def sample_views(
     sampling: str, rng: np.random.Generator, clip: ClipLayout, inputs: int, targets: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of at most `inputs` input views in the order of time, and of at most `targets` target views. Raises
-    InputError where the clip lacks the views that the sampling needs."""
+    """Indices of at most `inputs` input views in the order of time, and of at most `targets` target views. sampling:
+
+    setups  inputs as the paper's evaluation setups have them, targets among the other views
+    paper   36 views at random; inputs and targets are drawn from them independently, so they may overlap (4.1)
+    video   the four canonical views of the first frame and the front view of each frame (4.1, free Gaussians)
+    static  inputs and targets at one frame, which may overlap: the object as if it never moved (GS-LRM)
+
+    Raises InputError where the clip lacks the views that the sampling needs."""
     return SAMPLERS[sampling](rng, clip, inputs, targets)
 
 
