@@ -101,54 +101,18 @@ def render(args: argparse.Namespace) -> int:
 
 
 def train_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences; rendered with passes for --source given "
-                   "and --geometric")  # fmt: skip
-    p.add_argument("--out", type=Path, required=True, help="run folder; training goes on where it stands")
-    p.add_argument("--preset", choices=["tiny", "small", "base", "large"], default="tiny", help="network (default: "
-                   "tiny): base and large are the paper's, --head paper --source predicted; tiny and small are --head "
-                   "kinematic --source given; the six options below change what they name of it")  # fmt: skip
-    p.add_argument("--head", choices=["paper", "kinematic"], help="20 or 19 outputs a pixel (default: the preset's)")
-    p.add_argument("--source", choices=["given", "sweep", "predicted"], help="where depth comes from (default: the "
-                   "preset's)")  # fmt: skip
-    p.add_argument("--depth-range", choices=["paper", "centred"], help="for --source predicted (default: paper)")
-    p.add_argument("--time", choices=["free", "aligned"], help="of a pixel: free (default), or its frame's")
-    p.add_argument("--free", type=int, help="free Gaussians beside the pixels' (default: 0)")
-    p.add_argument("--motion", choices=["gaussian", "hexplane"], help="what moves Gaussians (default: gaussian)")
-    p.add_argument("--init", type=Path, help="checkpoint to start from, instead of random weights")
-    p.add_argument("--steps", type=int, default=100_000, help="stop after this many steps (default: 100000)")
-    p.add_argument("--minutes", type=float, help="stop after this long; the learning rate follows the clock")
-    p.add_argument(
-        "--sampling",
-        choices=["setups", "paper", "video", "static"],
-        default="setups",
-        help="views of a sample: as the evaluation setups (default), of 36 at random, front video, of one frame",
-    )
-    p.add_argument(
-        "--static", dest="sampling", action="store_const", const="static", help="short for --sampling static"
-    )
-    p.add_argument("--views", type=int, help="input views of a sample (default: 24; paper 12, video 27, static 4)")
-    p.add_argument("--targets", type=int, help="supervision views of a sample (default: 8; paper 24, static 4)")
-    p.add_argument("--mix", default="200:50:1", help="weights of much moving : moving : still clips, or uniform")
-    p.add_argument("--shrink", type=int, default=1, help="train at 1/N of the rendered size (curriculum; default: 1)")
-    p.add_argument("--rate", type=float, default=4e-4, help="peak learning rate (default: 4e-4)")
-    p.add_argument("--warmup", type=int, default=100, help="steps of linear warm-up (default: 100; the paper's: 2000)")
-    p.add_argument("--optimiser", choices=["adamw", "muon"], default="adamw", help="muon: for the blocks' matrices")
-    p.add_argument("--accumulate", type=int, default=1, help="samples per step (default: 1)")
-    p.add_argument("--perceptual", type=float, default=0.5, help="weight of the VGG-19 loss, if there are weights")
-    p.add_argument("--geometric", type=float, default=0.0, help="weight of the geometric loss, for RGB sources")
-    p.add_argument("--opacity", type=float, default=0.0, help="weight of the mean opacity (default: 0)")
-    p.add_argument("--bf16", action="store_true", help="run the transformer in bfloat16")
-    p.add_argument("--checkpointing", action="store_true", help="keep less memory, compute blocks twice")
-    p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
-    p.add_argument("--cache", type=Path, default=Path("data/cache"), help="where packed clips are kept")
-    p.add_argument("--seed", type=int, default=0)
+    from .model.training.config import add_arguments
+
+    add_arguments(p)
 
 
 def train(args: argparse.Namespace) -> int:
     """Train a network on rendered Sequences; stops by --steps or --minutes, and goes on where it stood."""
-    from .model.training.trainer import run
+    from .model.training.config import TrainConfig
+    from .model.training.trainer import train as run
 
-    return run(args)
+    run(TrainConfig.from_arguments(args))
+    return 0
 
 
 def reconstruct_arguments(p: argparse.ArgumentParser) -> None:

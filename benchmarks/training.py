@@ -20,9 +20,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from timesplat.cli import train_arguments
 from timesplat.model.network import Network
-from timesplat.model.training.trainer import STAGES, Trainer, load_clips, make_network
+from timesplat.model.training.config import TrainConfig, add_arguments
+from timesplat.model.training.reporting import STAGES
+from timesplat.model.training.trainer import Trainer, load_clips, make_network
 
 HEADER = ("network", "weights", "tokens", "steps/s", "CPU-s a step", *STAGES, "GFLOP", "floor, ms", "network is")
 
@@ -47,29 +48,30 @@ def step_flops(network: Network, tokens: float, checkpointing: bool) -> float:
     return 3 * (2 * matrices * tokens + attention) + again
 
 
-def measure(args: argparse.Namespace, steps: int) -> list[str]:
+def measure(config: TrainConfig, steps: int) -> list[str]:
     """A row of the table; the first step, which compiles, is left out."""
-    network = make_network(args).to(args.device)
-    trainer = Trainer(network, load_clips(args), args)
+    network = make_network(config).to(config.device)
+    trainer = Trainer(network, load_clips(config), config)
     tokens: list[int] = []
     network.blocks[0].register_forward_pre_hook(lambda module, inputs: tokens.append(len(inputs[0])))
-    trainer.train_step(np.zeros(len(STAGES)))
+    trainer.train_step()
     tokens.clear()
-    shares, wall, cpu = np.zeros(len(STAGES)), time.perf_counter(), time.process_time()
+    trainer.timer.reset()
+    wall, cpu = time.perf_counter(), time.process_time()
     for _ in range(steps):
-        trainer.train_step(shares)
+        trainer.train_step()
     wall, cpu = (time.perf_counter() - wall) / steps, (time.process_time() - cpu) / steps
-    flops = step_flops(network, float(np.sqrt(np.mean(np.square(tokens)))), args.checkpointing)
-    floor = flops / machine_rate(args.device, torch.bfloat16 if args.bf16 else torch.float32)
-    taken = shares[STAGES.index("network")] / steps
+    flops = step_flops(network, float(np.sqrt(np.mean(np.square(tokens)))), config.checkpointing)
+    floor = flops / machine_rate(config.device, torch.bfloat16 if config.bf16 else torch.float32)
+    taken = trainer.timer.seconds["network"] / steps
     weights = sum(p.numel() for p in network.parameters())
     return [
-        f"{args.preset}, {args.source}, {args.device}" + (", bf16" if args.bf16 else ""),
+        f"{config.preset}, {config.source}, {config.device}" + (", bf16" if config.bf16 else ""),
         f"{weights / 1e6:.1f} M",
         f"{np.mean(tokens):.0f}",
         f"{1 / wall:.2f}",
         f"{cpu:.2f}",
-        *(f"{x:.0%}" for x in shares / shares.sum()),
+        *(f"{x:.0%}" for x in trainer.timer.fractions.values()),
         f"{flops / 1e9:.0f}",
         f"{1000 * floor:.0f}",
         f"{taken / floor:.1f} times that",
@@ -84,14 +86,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10, help="to measure (default: 10)")
     args, more = parser.parse_known_args()
     train = argparse.ArgumentParser()
-    train_arguments(train)
+    add_arguments(train)
     print(f"{torch.get_num_threads()} threads, torch {torch.__version__}\n")
     print("|", " | ".join(HEADER), "|\n" + "|---" * len(HEADER) + "|")
     for preset in args.presets.split(","):
         for source in args.sources.split(","):
             with TemporaryDirectory() as out:
                 words = [*args.data, "--out", out, "--preset", preset, "--source", source, "--head", "kinematic", *more]
-                row = measure(train.parse_args(words), args.steps)
+                row = measure(TrainConfig.from_arguments(train.parse_args(words)), args.steps)
             print("|", " | ".join(row), "|", flush=True)
 
 

@@ -181,10 +181,10 @@ def arguments(data: list[str], out: Path, steps: int, options: dict) -> list[str
 
 def unknown_option(r: Run, options: AblationOptions) -> str | None:
     """What `timesplat train` has against a run's options; None where it takes them."""
-    from ..cli import train_arguments
+    from ..model.training.config import add_arguments
 
     parser = argparse.ArgumentParser(prog="train")
-    train_arguments(parser)
+    add_arguments(parser)
     for _, words in stages(r, options):
         said = io.StringIO()
         try:

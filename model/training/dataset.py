@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training data: rendered Sequences, packed once for quick random access, and samples drawn from them.
-
-Clips are of three groups, as the paper's data are (appendix, "Dataset Curation"): `hq4d` moves much, but not
-wildly; `4d` is all else that moves; `3d` are still objects, displaced or not. The paper draws from them 200:50:1.
-"""
+"""Training data: rendered Sequences, packed once for quick random access, and samples drawn from them."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,15 +18,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...datagen.rigs import CANONICAL
-from ...datagen.sequence import InputError, read_sequence, sequences_in
-from ..views import Views
-from .view_sampling import Layout, choose
+from ...datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from ..views import BACKGROUND, Views
+from .clip_groups import GROUPS, group_of, group_probabilities
+from .view_sampling import ClipLayout, sample_views
 
-VERSION = 2  # of packed files; others are made anew
-GROUPS = ("hq4d", "4d", "3d")
-# Bounds of `motion_measure`: below the first nothing moves; hq4d lies between the other two. (The paper keeps 3,000
-# of 32,000 objects, "sufficient but not overly aggressive"; of 135 of ours, animated files and zoo, 59.)
-STILL, SUFFICIENT, AGGRESSIVE = 0.01, 0.25, 0.45
+PACKED_VERSION = 2  # of packed files; others are made anew
 
 
 @dataclass
@@ -41,55 +35,84 @@ class Sample:
     name: str
 
 
-def pack(folder: Path, cache: Path, passes: bool = True) -> Path:
-    """Sequence folder -> one .safetensors below `cache`, made anew when the Sequence changed. Depth and
-    flow are kept for foreground pixels alone, in half precision. `passes`: whether they are needed; where they are not,
-    a Sequence that lacks them for a view is packed without any, by another name. Raises InputError."""
+class ClipDataset:
+    """Packed clips and random samples of them."""
+
+    def __init__(
+        self,
+        folders: Iterable[Path],
+        cache: Path,
+        shrink: int = 1,
+        sampling: str = "setups",
+        mix: str = "uniform",
+        has_depth: bool = True,
+    ):
+        """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
+        than what was rendered. sampling: see view_sampling.py; mix: see clip_groups.py; has_depth: whether inputs come
+        with depth and flow. Raises InputError where there is no Sequence, none that the mix would draw, or one without
+        the passes that are needed."""
+        self.shrink, self.sampling, self.has_depth = shrink, sampling, has_depth
+        folders = list(folders)
+        found = [p for f in folders for p in sequences_in(f)]
+        if not found:
+            raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
+        bar = tqdm(found, desc="packing", unit="clip", leave=False, disable=None)
+        self.paths = [pack(f, cache, has_depth) for f in bar]
+        self.groups: dict[str, list[Path]] = {g: [] for g in GROUPS}
+        for path in self.paths:
+            with safe_open(path, "pt") as f:
+                self.groups[group_of(f.metadata())].append(path)
+        self.probabilities = group_probabilities(mix, {g: len(paths) for g, paths in self.groups.items()})
+
+    def __str__(self) -> str:
+        parts = [f"{len(self.groups[g])} {g} ({p:.1%})" for g, p in zip(GROUPS, self.probabilities, strict=True)]
+        return f"{len(self.paths)} clips: {', '.join(parts)}"
+
+    def sample(self, rng: np.random.Generator, targets: int, inputs: int = 24) -> Sample:
+        """A clip at random, and of it at most `inputs` and `targets` views as `sampling` chooses them. Static samples
+        are at time 0, and nothing moves in them. Raises InputError where the clip lacks the views for it."""
+        group = self.groups[GROUPS[rng.choice(len(GROUPS), p=self.probabilities)]]
+        path = group[rng.integers(len(group))]
+        with safe_open(path, "pt") as f:
+            meta = f.metadata()
+            frame, camera = f.get_tensor("frame").numpy(), f.get_tensor("camera").numpy()
+            clip = ClipLayout(frame, camera, json.loads(meta["cameras"]), meta["asset"])
+            step = 2 / max(int(meta["frames"]) - 1, 1)
+            input_rows, target_rows = sample_views(self.sampling, rng, clip, inputs, targets)
+            seen = shrink(read_views(f, input_rows, step, self.has_depth), self.shrink)
+            wanted = shrink(read_views(f, target_rows, step, has_depth=False), self.shrink)
+        if self.sampling == "static":
+            seen.time, wanted.time = 0 * seen.time, 0 * wanted.time
+            seen.flow = None if seen.flow is None else 0 * seen.flow
+        return Sample(seen, wanted, meta["asset"])
+
+
+def pack(folder: Path, cache: Path, has_depth: bool = True) -> Path:
+    """Sequence folder -> one .safetensors below `cache`, made anew when the Sequence changed. has_depth: whether depth
+    and flow are needed; where they are not, a Sequence that lacks them for a view is packed without any, by another
+    name. Raises InputError for a Sequence that cannot be read, or lacks what is needed."""
     folder = Path(folder)
     stamp = (folder / "transforms.json").stat().st_mtime_ns if (folder / "transforms.json").is_file() else 0
-    key = hashlib.sha256(f"{VERSION} {folder.resolve()} {stamp}".encode()).hexdigest()[:16]
+    key = hashlib.sha256(f"{PACKED_VERSION} {folder.resolve()} {stamp}".encode()).hexdigest()[:16]
     path, pictures = (Path(cache) / f"{key}{end}.safetensors" for end in ("", "-pictures"))
-    for made in (path,) if passes else (path, pictures):
+    for made in (path,) if has_depth else (path, pictures):
         if made.exists():
             return made
     seq = read_sequence(folder)
     whole = all(v.passes for v in seq.views)
-    if passes and not whole:
+    if has_depth and not whole:
         raise InputError(
             f"{folder}: not every view has a depth pass, which --source given and --geometric need; "
             "render it with passes, or train with --source sweep or predicted alone."
         )
     path = path if whole else pictures
-    rgba, values, offsets = [], [], [0]
-    for i in range(len(seq.views)):
-        image = seq.load_image(i)
-        known, stack = np.zeros(image.shape[:2], bool), np.zeros((*image.shape[:2], 5))
-        if whole:
-            found = seq.load_passes(i)
-            known = np.isfinite(found.depth) & (image[..., 3] > 0)
-            depth = np.where(known, found.depth, 0)[..., None]
-            stack = np.concatenate([depth, found.flow_next, found.flow_prev], -1)
-        rgba.append(np.concatenate([image, known[..., None].astype(np.uint8)], -1))
-        values.append(stack[known].astype(np.float16))
-        offsets.append(offsets[-1] + int(known.sum()))
-    c2w, intrinsics = seq.cameras()
-    cameras = [v.camera for v in seq.views]
-    names = sorted(set(cameras))
-    tensors = {
-        "rgba": torch.from_numpy(np.stack(rgba)),  # the fifth channel says where depth is known
-        "values": torch.from_numpy(np.concatenate(values)),
-        "offsets": torch.tensor(offsets),
-        "c2w": torch.from_numpy(c2w),
-        "intrinsics": torch.from_numpy(intrinsics),
-        "time": torch.from_numpy(seq.times()),
-        "frame": torch.tensor([v.frame - seq.frame_start for v in seq.views]),
-        "camera": torch.tensor([names.index(c) for c in cameras]),
-    }
+    tensors = packed_tensors(seq, whole)
+    names = camera_names(seq)
     meta = {
         "cameras": json.dumps(names),
         "frames": str(seq.frame_end - seq.frame_start + 1),
         "asset": str(seq.provenance.get("asset", folder.parent.name)),
-        "motion": str(motion_measure(tensors, names)),
+        "motion": str(measure_motion(tensors, names)),
         "displaced": str(bool(seq.provenance.get("settings", {}).get("displace"))),
     }
     Path(cache).mkdir(parents=True, exist_ok=True)
@@ -99,111 +122,70 @@ def pack(folder: Path, cache: Path, passes: bool = True) -> Path:
     return path
 
 
-def motion_measure(tensors: dict[str, Tensor], names: list[str]) -> float:
-    """How much a packed clip moves: the greatest L1 distance between two frames of a camera that stands still
-    (appendix, "Dataset Curation"), mean over the canonical cameras. 0..1 per colour channel over white, per pixel
-    that the object covers at any of the frames, so that slim objects count as stout ones do; NaN where no canonical
-    camera has two frames."""
+def camera_names(seq: Sequence) -> list[str]:
+    """Of all cameras, in the order by which packed clips number them."""
+    return sorted({v.camera for v in seq.views})
+
+
+def packed_tensors(seq: Sequence, has_depth: bool) -> dict[str, Tensor]:
+    """What a packed clip of V views holds: rgba (V,H,W,5) uint8, whose fifth channel says where depth is known;
+    values (K,5) float16, depth and the two flows of those K pixels alone, view by view; offsets (V+1,) into them;
+    c2w (V,4,4), intrinsics (V,4), time (V,) as Views have them; frame (V,) from 0; camera (V,), its number."""
+    rgba, values, offsets = [], [], [0]
+    for i in range(len(seq.views)):
+        image = seq.load_image(i)
+        known, stack = np.zeros(image.shape[:2], bool), np.zeros((*image.shape[:2], 5))
+        if has_depth:
+            passes = seq.load_passes(i)
+            known = np.isfinite(passes.depth) & (image[..., 3] > 0)
+            depth = np.where(known, passes.depth, 0)[..., None]
+            stack = np.concatenate([depth, passes.flow_next, passes.flow_prev], -1)
+        rgba.append(np.concatenate([image, known[..., None].astype(np.uint8)], -1))
+        values.append(stack[known].astype(np.float16))
+        offsets.append(offsets[-1] + int(known.sum()))
+    c2w, intrinsics = seq.cameras()
+    names = camera_names(seq)
+    return {
+        "rgba": torch.from_numpy(np.stack(rgba)),
+        "values": torch.from_numpy(np.concatenate(values)),
+        "offsets": torch.tensor(offsets),
+        "c2w": torch.from_numpy(c2w),
+        "intrinsics": torch.from_numpy(intrinsics),
+        "time": torch.from_numpy(seq.times()),
+        "frame": torch.tensor([v.frame - seq.frame_start for v in seq.views]),
+        "camera": torch.tensor([names.index(v.camera) for v in seq.views]),
+    }
+
+
+def measure_motion(tensors: dict[str, Tensor], names: list[str]) -> float:
+    """How much a packed clip moves (tensors: see `packed_tensors`; names of its cameras): the greatest L1 distance
+    between two frames of a camera that stands still (paper, appendix, "Dataset Curation"), mean over the canonical
+    cameras. 0..1 per colour channel over white, per pixel that the object covers at any of the frames, so that slim
+    objects count as stout ones do; NaN where no canonical camera has two frames."""
     found = []
     for name in CANONICAL:
         here = (tensors["camera"] == names.index(name)) if name in names else torch.zeros(1, dtype=torch.bool)
         if here.sum() < 2:
             continue
         rgba = tensors["rgba"][here][..., :4].float() / 255
-        over = (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]).flatten(1)
+        over = (rgba[..., :3] * rgba[..., 3:] + BACKGROUND - BACKGROUND * rgba[..., 3:]).flatten(1)
         covered = (rgba[..., 3] > 0).any(0).sum().clamp_min(1)
         found.append(float(torch.cdist(over, over, p=1).max() / (3 * covered)))
     return float(np.mean(found)) if found else float("nan")
 
 
-def group_of(meta: dict[str, str]) -> str:
-    """The group of a packed clip; one of unknown motion is of 4d."""
-    motion = float(meta["motion"])
-    if meta["displaced"] == "True" or meta["frames"] == "1" or motion < STILL:
-        return "3d"
-    return "hq4d" if SUFFICIENT <= motion < AGGRESSIVE else "4d"
-
-
-def parse_mix(text: str) -> dict[str, float] | None:
-    """ "200:50:1" -> weight of each group; "uniform" -> None: every clip is as likely. Raises InputError."""
-    if text == "uniform":
-        return None
-    try:
-        weights = dict(zip(GROUPS, map(float, text.split(":")), strict=True))
-        if min(weights.values()) < 0 or not np.isfinite(sum(weights.values())):
-            raise ValueError
-    except ValueError:
-        raise InputError(f"--mix {text}: not weights of {':'.join(GROUPS)}; write 200:50:1, or uniform.") from None
-    return weights
-
-
-class Clips:
-    """Packed clips and random samples of them."""
-
-    def __init__(
-        self,
-        folders: list[Path],
-        cache: Path,
-        shrink: int = 1,
-        sampling: str = "setups",
-        mix: str = "uniform",
-        passes: bool = True,
-    ):
-        """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
-        than what was rendered. sampling: see sampling.py; mix: see `parse_mix`, groups without clips are left out;
-        passes: whether inputs come with depth and flow. Raises InputError where there is no Sequence, none that the
-        mix would draw, or one without the passes that are needed."""
-        self.shrink, self.sampling, self.passes = shrink, sampling, passes
-        weights = parse_mix(mix)
-        found = [p for f in folders for p in sequences_in(f)]
-        if not found:
-            raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
-        bar = tqdm(found, desc="packing", unit="clip", leave=False, disable=None)
-        self.paths = [pack(f, cache, passes) for f in bar]
-        self.groups: dict[str, list[Path]] = {}
-        for path in self.paths:
-            with safe_open(path, "pt") as f:
-                self.groups.setdefault(group_of(f.metadata()), []).append(path)
-        counts = {g: len(self.groups.get(g, [])) for g in GROUPS}
-        share = {g: counts[g] if weights is None else weights[g] * (counts[g] > 0) for g in GROUPS}
-        if not sum(share.values()):
-            raise InputError(f"--mix {mix}: none of the clips is of a group with weight; there are {counts}.")
-        self.weights = np.array([share[g] for g in GROUPS]) / sum(share.values())
-
-    def __str__(self) -> str:
-        parts = [f"{len(self.groups.get(g, []))} {g} ({w:.1%})" for g, w in zip(GROUPS, self.weights, strict=True)]
-        return f"{len(self.paths)} clips: {', '.join(parts)}"
-
-    def sample(self, rng: np.random.Generator, targets: int, views: int = 24) -> Sample:
-        """A clip at random, and of it at most `views` input and `targets` target views as `sampling` chooses them.
-        Static samples are at time 0, and nothing moves in them."""
-        group = self.groups[GROUPS[rng.choice(len(GROUPS), p=self.weights)]]
-        path = group[rng.integers(len(group))]
-        with safe_open(path, "pt") as f:
-            meta = f.metadata()
-            frame, camera = f.get_tensor("frame").numpy(), f.get_tensor("camera").numpy()
-            clip = Layout(frame, camera, json.loads(meta["cameras"]), meta["asset"])
-            step = 2 / max(int(meta["frames"]) - 1, 1)
-            chosen = choose(self.sampling, rng, clip, views, targets)
-            parts = zip(chosen, (self.passes, False), strict=True)
-            inputs, held_out = (shrink(_views(f, i, step, passes), self.shrink) for i, passes in parts)
-        if self.sampling == "static":
-            inputs.time, held_out.time = 0 * inputs.time, 0 * held_out.time
-            inputs.flow = inputs.flow if inputs.flow is None else 0 * inputs.flow
-        return Sample(inputs, held_out, meta["asset"])
-
-
-def _views(f, indices: np.ndarray, step: float, passes: bool) -> Views:
+def read_views(packed, rows: np.ndarray, frame_step: float, has_depth: bool) -> Views:
+    """Views `rows` (n,) of an open packed clip, with depth and flow where asked for."""
     # get_slice takes no index lists: whole tensors are memory-mapped, and only these rows are touched.
-    rows = torch.from_numpy(np.asarray(indices))
-    packed = f.get_tensor("rgba")[rows]
-    rgba = packed[..., :4].float() / 255
-    tensors = [f.get_tensor(k)[rows] for k in ("c2w", "intrinsics", "time")]
-    views = Views(rgba[..., :3], rgba[..., 3], *tensors, step)
-    if not passes:
+    rows = torch.from_numpy(np.asarray(rows))
+    pixels = packed.get_tensor("rgba")[rows]
+    rgba = pixels[..., :4].float() / 255
+    tensors = [packed.get_tensor(k)[rows] for k in ("c2w", "intrinsics", "time")]
+    views = Views(rgba[..., :3], rgba[..., 3], *tensors, frame_step)
+    if not has_depth:
         return views
-    offsets, values = f.get_tensor("offsets"), f.get_tensor("values")
-    known = packed[..., 4] > 0
+    offsets, values = packed.get_tensor("offsets"), packed.get_tensor("values")
+    known = pixels[..., 4] > 0
     depth = torch.full(known.shape, torch.inf)
     flow = torch.zeros(*known.shape, 4)
     for n, i in enumerate(rows.tolist()):

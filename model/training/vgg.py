@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Features of VGG-16 and VGG-19 (Simonyan & Zisserman 2014) for perceptual losses and metrics.
-
-The layers are in the order of torchvision's `features`, so that its weight files fit:
-
-    path = find_weights("vgg16")                          # None where there is none
-    network = VGG(16).load(path)
-    maps = network(x, ["relu1_2", "relu2_2"])             # x (N,3,H,W) in 0..1 -> list of (N,C,h,w)
-
-Files are looked for in the folder that $TIMESPLAT_WEIGHTS names, then in torch's hub cache. None is fetched.
-"""
+"""Features of VGG-16 and VGG-19 (Simonyan & Zisserman 2014) for perceptual losses and metrics."""
 
 from __future__ import annotations
 
@@ -22,12 +13,16 @@ from ...datagen.sequence import InputError
 
 CONVOLUTIONS = {16: (2, 2, 3, 3, 3), 19: (2, 2, 4, 4, 4)}  # by block; a pooling ends each
 CHANNELS = (64, 128, 256, 512, 512)
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the pictures that the weights were trained on
+IMAGENET_MEAN, IMAGENET_STD = (
+    (0.485, 0.456, 0.406),
+    (0.229, 0.224, 0.225),
+)  # of the pictures that the weights were trained on
 
 
 class VGG(nn.Module):
-    """The convolutions of VGG-`depth` without gradients of their own, in evaluation mode. pool: "max" as trained,
-    or "average" as perceptual losses have it (smoother gradients)."""
+    """The convolutions of VGG-`depth` (16 or 19) without gradients of their own, in evaluation mode. The layers are in
+    the order of torchvision's `features`, so that its weight files fit. pool: "max" as trained, or "average" as
+    perceptual losses have it (smoother gradients)."""
 
     def __init__(self, depth: int, pool: str = "max"):
         super().__init__()
@@ -42,8 +37,8 @@ class VGG(nn.Module):
             self.names.append(f"pool{block}")
             layers.append(nn.MaxPool2d(2) if pool == "max" else nn.AvgPool2d(2))
         self.features = nn.Sequential(*layers)
-        self.register_buffer("mean", torch.tensor(MEAN)[:, None, None], persistent=False)
-        self.register_buffer("std", torch.tensor(STD)[:, None, None], persistent=False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
         self.eval().requires_grad_(False)
 
     def forward(self, x: Tensor, layers: list[str]) -> list[Tensor]:
@@ -74,7 +69,7 @@ class VGG(nn.Module):
 
 def find_weights(name: str) -> Path | None:
     """The file `NAME.pth` or `NAME-*.pth` ("vgg16" finds vgg16-397923af.pth, not vgg16_bn-….pth) in the folder
-    $TIMESPLAT_WEIGHTS or in torch's hub cache; None where neither has one."""
+    $TIMESPLAT_WEIGHTS, else in torch's hub cache; None where neither has one. None is fetched."""
     folders = [Path(torch.hub.get_dir()) / "checkpoints"]
     if os.environ.get("TIMESPLAT_WEIGHTS"):
         folders.insert(0, Path(os.environ["TIMESPLAT_WEIGHTS"]))

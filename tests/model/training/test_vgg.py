@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError
-from timesplat.model.training.vgg import MEAN, STD, VGG, find_weights
+from timesplat.model.training.vgg import IMAGENET_MEAN, IMAGENET_STD, VGG, find_weights
 
 
 def test_layers_are_where_torchvision_has_them():
@@ -37,7 +37,7 @@ def test_features_by_hand(weights):
     x = torch.rand(2, 3, 32, 32, requires_grad=True)
     low, high = network(x, ["relu1_1", "pool2"])
     assert low.shape == (2, 64, 32, 32) and high.shape == (2, 128, 8, 8)
-    normal = (x - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]
+    normal = (x - torch.tensor(IMAGENET_MEAN)[:, None, None]) / torch.tensor(IMAGENET_STD)[:, None, None]
     first = network.features[0]
     torch.testing.assert_close(low, torch.nn.functional.conv2d(normal, first.weight, first.bias, padding=1).relu())
     high.sum().backward()
