@@ -168,7 +168,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     import time
 
     from .datagen.sequence import read_sequence
-    from .model.fitting.budget import parse
+    from .model.fitting.budget import parse_budget
     from .model.fitting.refine import check_seconds
     from .model.geometry.coverage import SURFACES, coverage
     from .model.io.asset import write_ply
@@ -179,7 +179,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     check_seconds(args.refine)
     if args.budget:
-        parse(args.budget)
+        parse_budget(args.budget)
     seq = read_sequence(args.sequence)
     rigs = sorted({v.rig for v in seq.views})
     if args.rig and args.rig not in rigs:

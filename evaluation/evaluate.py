@@ -24,7 +24,7 @@ from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
 from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
-from ..model.fitting.budget import parse as parse_budget
+from ..model.fitting.budget import parse_budget
 from ..model.gaussians import Gaussians4D, Moving
 from ..model.parallel import clock
 from ..model.rasterize import render

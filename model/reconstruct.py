@@ -98,7 +98,7 @@ def reconstruct_views(
     """The same from tensors; unfiltered. `seconds` is for methods that fit a scene, `progress` for what takes
     seconds; `dense`: tokens of a network everywhere, and not only where the object is."""
     if refine or budget:
-        from .fitting.budget import reduced
+        from .fitting.budget import apply_budget
         from .fitting.refine import check_seconds, start_size
         from .fitting.refine import refine as fit
 
@@ -108,22 +108,22 @@ def reconstruct_views(
         seen = views if near or method in FITTED or "%" in (budget or "") else start_size(views)
         start = reconstruct_views(seen, method, device, checkpoint, seconds, dense=dense)
         if budget:
-            told = {"near": near, "max_loss": max_loss, "device": drawing, "progress": progress}
-            return reduced(start, views, budget, refine, **told)
-        return fit(start, views, refine, drawing, near=near, progress=progress)
+            told = {"has_depth": near, "max_loss": max_loss, "device": drawing, "progress": progress}
+            return apply_budget(start, views, budget, refine, **told)
+        return fit(start, views, refine, drawing, has_depth=near, progress=progress)
     if method in ("white", "hull"):
-        from .baselines import visual_hull as hull
+        from .baselines.visual_hull import visual_hull, white
 
-        return getattr(hull, method)(views)
+        return {"white": white, "hull": visual_hull}[method](views)
     if method == "lift":
         from .geometry.lift import lift
 
         return lift(views)
     if method in FITTED:
         from .baselines.four_dgs import four_dgs
-        from .baselines.shape_of_motion import som
+        from .baselines.shape_of_motion import shape_of_motion
 
-        return {"4dgs": four_dgs, "som": som}[method](views, _draws(device), seconds, progress=progress)
+        return {"4dgs": four_dgs, "som": shape_of_motion}[method](views, _draws(device), seconds, progress=progress)
     network = load_network(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(method, method)}.safetensors", device)
 
     def run(views: Views) -> Gaussians4D:

@@ -114,12 +114,12 @@ def _reconstruct(request: dict, progress) -> dict:
     from .reconstruct import clip_of, reconstruct  # imports torch
 
     if refine or budget:  # refuse now what else is found out after seconds
-        from .fitting.budget import parse
+        from .fitting.budget import parse_budget
         from .fitting.refine import check_seconds
 
         check_seconds(refine)
         if budget:
-            parse(budget)
+            parse_budget(budget)
     checkpoint = request.get("checkpoint")
     compiled = any(Path(__file__).parent.rglob("__pycache__/*.nbi"))  # numba's, of an earlier run
     note = "" if compiled else "; the first run compiles, which takes half a minute"
