@@ -311,7 +311,7 @@ def held_out(folder: Path, by: int, limit: int | None) -> list[tuple]:
         inputs, targets = ([i for i, v in enumerate(seq.views) if (v.rig == "target") == t] for t in (False, True))
         if not inputs or not targets:
             raise InputError(f"{f}: it needs input views and views of the rig `target` to score.")
-        pairs.append([shrink(load_views(seq, i, passes=True), by) for i in (inputs, targets)])
+        pairs.append([shrink(load_views(seq, i, with_depth=True), by) for i in (inputs, targets)])
     return pairs
 
 
@@ -319,7 +319,8 @@ def score(folder: Path, pairs: list[tuple]) -> dict:
     """Per-object scores of a run's averaged weights, and of the empty picture."""
     import torch
 
-    from ..model.reconstruct import apply_network, load_network
+    from ..model.checkpoints_io import load_network
+    from ..model.inference import apply_network
     from .evaluate import draw
     from .metrics import psnr, psnr_foreground
 

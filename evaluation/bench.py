@@ -30,11 +30,13 @@ import torch
 from tqdm import tqdm
 
 from ..datagen.sequence import InputError, Sequence, read_sequence
+from ..model.checkpoints_io import CHECKPOINTS
+from ..model.clip import clip_of
 from ..model.fitting.budget import SECONDS
-from ..model.geometry.coverage import SURFACES, coverage
+from ..model.geometry.coverage import coverage
 from ..model.io.asset import write_ply
+from ..model.methods import METHODS
 from ..model.parallel import clock
-from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, clip_of
 from ..model.views import Views
 from . import protocol
 from .evaluate import Plan, append, draw, evaluate_views, key_of, load_inputs, load_truth, parse_method, read_rows
@@ -72,13 +74,13 @@ class Way:
     seconds: float = 0.0  # of fitting, for methods that fit a scene
 
     @property
-    def passes(self) -> bool:
+    def has_depth(self) -> bool:
         """Whether it sees depth and motion, not RGB and alpha alone."""
-        return self.name in NEEDS_PASSES
+        return METHODS[self.name].has_depth
 
     @property
     def baseline(self) -> bool:
-        return not METHODS[self.name].startswith("ours")
+        return METHODS[self.name].baseline
 
     @property
     def fit(self) -> float:
@@ -88,7 +90,8 @@ class Way:
 
     @property
     def checkpoint(self) -> Path | None:
-        return CHECKPOINTS / f"{WEIGHTS.get(self.name, self.name)}-{self.weights}.safetensors" if self.weights else None
+        base = METHODS[self.name].checkpoint or self.name
+        return CHECKPOINTS / f"{base}-{self.weights}.safetensors" if self.weights else None
 
 
 def parse(label: str) -> Way:
@@ -99,7 +102,7 @@ def parse(label: str) -> Way:
     name, weights, seconds, options = match.groups(default="")
     spec = name + options
     parse_method(spec)
-    if (name in ("4dgs", "som")) != bool(seconds):
+    if METHODS[name].fits != bool(seconds):
         raise InputError(f"{label}: 4dgs and som, and they alone, take seconds; write for example 4dgs:10.")
     way = Way(label.strip(), name, spec, weights, float(seconds or 0))
     if way.checkpoint and not way.checkpoint.is_file():
@@ -127,7 +130,7 @@ def plan(sequences: dict[str, Sequence], quick: bool = False, methods: list[str]
     labels, notes = methods or [*CENTRE, *_other_weights()], []
     if lacking := [n for n, s in sequences.items() if not all(v.passes for v in s.views)]:
         notes.append(f"No depth-guided way: {lacking[0]} has no depth and motion passes.")
-        labels = [x for x in labels if not parse(x).passes]
+        labels = [x for x in labels if not parse(x).has_depth]
     labels = [x for x in labels if not quick or parse(x).fit <= QUICK]
     setup = next(s for s in ("random", "alternating", "") if all(_has(seq, s) for seq in sequences.values()))
     if setup != "random":
@@ -148,7 +151,7 @@ def plan(sequences: dict[str, Sequence], quick: bool = False, methods: list[str]
 
 def _other_weights() -> list[str]:
     """Ways with checkpoints of other sizes, which are named METHOD-….safetensors."""
-    names = [(n, WEIGHTS.get(n, n)) for n in ("guided", "rgb", "predicted")]
+    names = [(n, METHODS[n].checkpoint) for n in ("guided", "rgb", "predicted")]
     return [f"{n}@{f.stem[len(w) + 1 :]}" for n, w in names for f in sorted(CHECKPOINTS.glob(f"{w}-*.safetensors"))]
 
 
@@ -190,13 +193,13 @@ def measure(name: str, seq: Sequence, point: Point) -> dict:
     """One row: COLUMNS of a Point on an object. None where a figure cannot be: a scene that is no 4D Gaussians has
     no files, for example."""
     way, views, truth = parse(point.label), _views(seq.root, point.setup, point.size), _truth(seq.root, point.size)
-    what = views if way.passes else replace(views, depth=None, flow=None)
+    what = views if way.has_depth else replace(views, depth=None, flow=None)
     row, scene = evaluate_views(what, way.spec, truth, way.checkpoint, None, way.seconds)
     start = clock()
     draw(scene, truth.views)
     row["render_ms"] = 1000 * (clock() - start) / len(truth.picture)
     row["ply_mb"], row["usd_mb"] = megabytes(scene, seq)
-    row["coverage"] = coverage(scene, what)[0] if way.spec in SURFACES else None
+    row["coverage"] = coverage(scene, what)[0] if way.spec in METHODS and METHODS[way.spec].knows_surface else None
     row |= {"gaussians": row["gaussians_kept"], "object": name, "way": way.label, "setup": point.setup}
     row |= {"views": len(views), "size": point.size}
     return {k: row[k] for k in COLUMNS}

@@ -126,16 +126,16 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
         drawn.append(([x, x], [y - error, y + error]))
         ax.errorbar(
             x, y, yerr=error or None, color=colour, ecolor=colour, elinewidth=0.8, capsize=2, linestyle="none",
-            marker="s" if m.way.passes else "o", zorder=4,
+            marker="s" if m.way.has_depth else "o", zorder=4,
             markersize=3 if cost == "seconds" and "budget" in m.way.spec else 5,
             markerfacecolor="white" if m.way.baseline else colour,
         )  # fmt: skip
-    for passes in (True, False):
-        best = on_frontier([m for m in means if m.way.passes == passes], cost, worth)
+    for has_depth in (True, False):
+        best = on_frontier([m for m in means if m.way.has_depth == has_depth], cost, worth)
         x, y = [m.mean[cost] for m in best], [m.mean[worth] for m in best]
         look = {"color": "#606060", "drawstyle": "steps-post", "zorder": 1}
         ax.plot(x, y, linewidth=5, alpha=0.15, **look)
-        ax.plot(x, y, linewidth=0.9, linestyle="-" if passes else ":", **look)
+        ax.plot(x, y, linewidth=0.9, linestyle="-" if has_depth else ":", **look)
         drawn.append((np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]))
     ax.margins(0.12, 0.08)
     if worth == "flip":
@@ -163,10 +163,10 @@ def key(ax, means: list[Mean]) -> None:
     from matplotlib.lines import Line2D
 
     made, look = [], {"color": "#404040", "linestyle": "none", "markersize": 5}
-    for passes in (True, False):
-        if any(m.way.passes == passes for m in means):
-            mark, style = ("s", "-") if passes else ("o", ":")
-            made.append(Line2D([], [], marker=mark, label=f"sees {SEES[passes]}", **look))
+    for has_depth in (True, False):
+        if any(m.way.has_depth == has_depth for m in means):
+            mark, style = ("s", "-") if has_depth else ("o", ":")
+            made.append(Line2D([], [], marker=mark, label=f"sees {SEES[has_depth]}", **look))
             made.append(Line2D([], [], color="#606060", linestyle=style, label="its Pareto frontier"))
     if any(m.way.baseline for m in means):
         made.append(Line2D([], [], marker="o", markerfacecolor="white", label="hollow: baselines", **look))
@@ -234,7 +234,7 @@ def draw_inputs(means: list[Mean], setup: str, size: int):
             x = [m.views if x_name == "views" else m.mean["seconds"] for m in line]
             y, way, colour = [m.mean[y_name] for m in line], line[0].way, FAMILIES[line[0].way.name]
             ax.plot(
-                x, y, color=colour, linewidth=1.2, marker="s" if way.passes else "o", markersize=4.5,
+                x, y, color=colour, linewidth=1.2, marker="s" if way.has_depth else "o", markersize=4.5,
                 linestyle="--" if "refine" in w else "-", markerfacecolor="white" if way.baseline else colour,
             )  # fmt: skip
             labels.append((x[-1], y[-1], w, colour))
@@ -343,8 +343,8 @@ def frontiers(centre: list[Mean]) -> str:
         if not any(m.mean[cost] for m in centre):
             continue
         for sees in (True, False, None):
-            group = [m for m in centre if sees is None or m.way.passes == sees]
-            if not group or (sees is None and len({m.way.passes for m in centre}) == 1):
+            group = [m for m in centre if sees is None or m.way.has_depth == sees]
+            if not group or (sees is None and len({m.way.has_depth for m in centre}) == 1):
                 continue
             best = on_frontier(group, cost, worth)
             base = ", ".join(m.way.label for m in best if m.way.baseline) or "none"
@@ -367,7 +367,7 @@ def table(means: list[Mean]) -> str:
     for m in means:
         figures = {k: cell(m.mean[k], m.error[k] if k in ("psnr", "flip") else 0, digits[k]) for k in FIGURES}
         gain = cell(m.gain.get("psnr"), m.gain_error.get("psnr", 0), 2, True)
-        first = [m.way.label, SEES[m.way.passes], str(m.views), str(m.size), figures["seconds"], figures["psnr"]]
+        first = [m.way.label, SEES[m.way.has_depth], str(m.views), str(m.size), figures["seconds"], figures["psnr"]]
         last = [figures[k] for k in FIGURES[2:]]
         lines.append("| " + " | ".join([*first, gain, *last]) + " |")
     return "\n".join(lines)

@@ -39,7 +39,7 @@ def sheet(seq: Sequence, frames: int):
             first = first or (name, [i for i in indices if i is not None] if None not in indices else [])
     name, indices = first
     if indices and all(seq.views[i].passes for i in indices):
-        views = load_views(seq, indices, passes=True)
+        views = load_views(seq, indices, with_depth=True)
         rows[f"depth, {name}"] = _depth(views.depth)
         rows[f"motion, {name}"] = _motion(views.flow[..., :2])
     return grid(rows, [f"frame {f}" for f in chosen])

@@ -12,10 +12,10 @@ import torch
 from tqdm import tqdm
 
 from ..datagen.render import Settings, render_shots
+from ..model.clip import clip_of
 from ..model.gaussians import Gaussians4D
 from ..model.io.asset import write_ply
 from ..model.io.usd_write import write_usd
-from ..model.reconstruct import clip_of
 from ..model.views import Views, load_views
 from .evaluate import draw, evaluate_method, warm_up
 from .pictures import grid, video

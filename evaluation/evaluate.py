@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Scores: methods on views of rendered Sequences, many at a time, and again where a run was interrupted.
 
-    views, truth = load_inputs(seq, chosen, passes=True), load_truth(seq, scored, fresh)
+    views, truth = load_inputs(seq, chosen, with_depth=True), load_truth(seq, scored, fresh)
     row, scene = evaluate_views(views, "guided", truth)     # what `tables` sums up
 
 `evaluate_folders` does this for objects x setups x sizes x methods, and writes every row to rows.jsonl at once.
@@ -24,12 +24,15 @@ from torch.nn.functional import avg_pool2d
 from tqdm import tqdm
 
 from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from ..model import baselines  # noqa: F401, adds its methods
+from ..model.checkpoints_io import CHECKPOINTS
 from ..model.fitting.budget import parse_budget
 from ..model.gaussians import Gaussians4D, Moving
+from ..model.methods import METHODS, ReconstructOptions
 from ..model.parallel import clock
 from ..model.rasterize import render
 from ..model.rasterize.timeline import WORTH, Timeline
-from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
+from ..model.reconstruct import reconstruct_views
 from ..model.training.dataset import shrink
 from ..model.views import Views, load_views
 from . import protocol
@@ -58,9 +61,9 @@ class Method:
     dense: bool = False  # a network's tokens everywhere, not only where the object is
 
     @property
-    def passes(self) -> bool:
+    def has_depth(self) -> bool:
         """Whether it sees depth and motion, not RGB and alpha alone."""
-        return self.name in NEEDS_PASSES
+        return METHODS[self.name].has_depth
 
 
 def parse_method(spec: str) -> Method:
@@ -97,11 +100,11 @@ class Truth:
         return self.seen[i]
 
 
-def load_inputs(seq: Sequence, indices, passes: bool, size: int | None = None) -> Views:
+def load_inputs(seq: Sequence, indices, with_depth: bool, size: int | None = None) -> Views:
     """Views at `size` pixels, a whole fraction of what was rendered (all of it by default). Raises InputError."""
     by = _fraction(seq, size)
-    views = load_views(seq, indices, passes)
-    if passes or by == 1:
+    views = load_views(seq, indices, with_depth)
+    if with_depth or by == 1:
         return shrink(views, by)
     nothing = replace(views, depth=torch.full_like(views.alpha, torch.inf), flow=views.alpha.new_zeros(()))
     nothing.flow = nothing.flow.expand(*views.alpha.shape, 4)
@@ -172,11 +175,14 @@ def evaluate_views(
     wanted = parse_method(method)
     start = clock()
     with torch.no_grad():  # methods that optimise turn gradients on again
-        refine = wanted.refine or 0.0
-        scene = reconstruct_views(
-            views, wanted.name, checkpoint=checkpoint, seconds=seconds, refine=refine, budget=wanted.budget,
+        options = ReconstructOptions(
+            checkpoint=checkpoint,
+            seconds=seconds,
+            refine=wanted.refine or 0.0,
+            budget=wanted.budget,
             dense=wanted.dense,
-        )  # fmt: skip
+        )
+        scene = reconstruct_views(views, wanted.name, options)
         kept = scene[scene.alive()]
     taken = clock() - start
     frames = score(kept, truth, lpips)
@@ -188,7 +194,7 @@ def evaluate_views(
 def evaluate_method(seq: Sequence, method: str, inputs, targets, checkpoint: Path | None = None):
     """`evaluate_views` of a Sequence's views `inputs`, on its views `targets` (indices)."""
     truth = load_truth(seq, targets, protocol.novel(seq, list(inputs), list(targets)))
-    return evaluate_views(load_inputs(seq, inputs, parse_method(method).passes), method, truth, checkpoint)
+    return evaluate_views(load_inputs(seq, inputs, parse_method(method).has_depth), method, truth, checkpoint)
 
 
 def warm_up(seq: Sequence, inputs, methods: list[str], checkpoint: Path | None = None) -> None:
@@ -196,11 +202,10 @@ def warm_up(seq: Sequence, inputs, methods: list[str], checkpoint: Path | None =
     seconds, the first time on a machine) or imports."""
     with torch.no_grad():
         for method in map(parse_method, methods):
-            views = load_views(seq, inputs[:2], method.passes)
+            views = load_views(seq, inputs[:2], method.has_depth)
             refine = min(method.refine or 0.0, 0.1)
-            scene = reconstruct_views(
-                views, method.name, checkpoint=checkpoint, seconds=0.1, refine=refine, budget=method.budget
-            )
+            options = ReconstructOptions(checkpoint=checkpoint, seconds=0.1, refine=refine, budget=method.budget)
+            scene = reconstruct_views(views, method.name, options)
             draw(scene, views[:1])
 
 
@@ -240,7 +245,7 @@ def key_of(seq: Sequence, setup: str, size: int | None, stride: int, method: str
 def weights_of(method: str, checkpoint: Path | None = None) -> Path:
     """The checkpoint that a method loads, if it loads one."""
     name = parse_method(method).name
-    return Path(checkpoint or CHECKPOINTS / f"{WEIGHTS.get(name, name)}.safetensors")
+    return Path(checkpoint or CHECKPOINTS / f"{METHODS[name].checkpoint or name}.safetensors")
 
 
 def evaluate_object(
@@ -249,7 +254,7 @@ def evaluate_object(
     """All runs of a setup on one Sequence. Those in `known` {key: row} are taken from there, others are appended
     to the file `rows` as soon as they are made."""
     chosen = protocol.inputs(seq, setup) if setup else [i for i, v in enumerate(seq.views) if v.rig != "target"]
-    passes = all(seq.views[i].passes for i in chosen) and any(parse_method(m).passes for m in plan.methods)
+    with_depth = all(seq.views[i].passes for i in chosen) and any(parse_method(m).has_depth for m in plan.methods)
     found, at, views, truth = [], None, None, None
     for size, stride, method in plan.runs(setup):
         key = key_of(seq, setup, size, stride, method, plan, bool(lpips))
@@ -259,8 +264,8 @@ def evaluate_object(
             if at != (size, stride):
                 scored, at = protocol.targets(seq, stride), (size, stride)
                 truth = load_truth(seq, scored, protocol.novel(seq, chosen, scored), size)
-                views = load_inputs(seq, chosen, passes, size)
-            what = replace(views, depth=None, flow=None) if not parse_method(method).passes else views
+                views = load_inputs(seq, chosen, with_depth, size)
+            what = replace(views, depth=None, flow=None) if not parse_method(method).has_depth else views
             row, _ = evaluate_views(what, method, truth, plan.checkpoint, lpips, plan.seconds)
             row |= {"key": key, "object": name, "setup": setup, "size": size or seq.width, "stride": stride}
             row |= {"method": method, "jobs": plan.jobs}

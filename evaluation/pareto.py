@@ -68,7 +68,7 @@ class Mean:
 
 def reference(way: Way) -> str:
     """The way at the centre that a way is compared with: they see the same."""
-    return "guided" if way.passes else "rgb"
+    return "guided" if way.has_depth else "rgb"
 
 
 def summarise(rows: list[dict], centre: tuple[str, int]) -> list[Mean]:

@@ -14,7 +14,9 @@ import torch
 
 from ..datagen.rigs import CANONICAL
 from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
-from ..model.reconstruct import CHECKPOINTS, WEIGHTS, reconstruct_views
+from ..model.checkpoints_io import CHECKPOINTS
+from ..model.methods import METHODS, ReconstructOptions
+from ..model.reconstruct import reconstruct_views
 from ..model.views import Views
 from . import protocol
 from .evaluate import Truth, evaluate_views, load_inputs, load_truth, parse_method
@@ -44,7 +46,7 @@ class Method:
     def stamp(self) -> str:
         """Changes with the method and the weights it loads."""
         base = parse_method(self.name).name
-        path = self.checkpoint or CHECKPOINTS / f"{WEIGHTS.get(base, base)}.safetensors"
+        path = self.checkpoint or CHECKPOINTS / f"{METHODS[base].checkpoint or base}.safetensors"
         weights = hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.is_file() else "-"
         return f"{self.name} {weights}"
 
@@ -74,7 +76,7 @@ class Subject:
     size: int
 
     def views(self, indices: list[int], method: Method) -> Views:
-        return load_inputs(self.seq, indices, parse_method(method.name).passes, self.size)
+        return load_inputs(self.seq, indices, parse_method(method.name).has_depth, self.size)
 
     def truth(self, inputs: list[int], targets: list[int]) -> Truth:
         novel = protocol.novel(self.seq, inputs, targets)
@@ -149,7 +151,8 @@ def reconstruct(views: Views, method: Method):
     """The scene, without what the inference filters would never draw."""
     with torch.no_grad():  # methods that fit a scene turn gradients on again
         wanted = parse_method(method.name)
-        scene = reconstruct_views(views, wanted.name, checkpoint=method.checkpoint, refine=wanted.refine or 0.0)
+        options = ReconstructOptions(checkpoint=method.checkpoint, refine=wanted.refine or 0.0)
+        scene = reconstruct_views(views, wanted.name, options)
     return scene[scene.alive()]
 
 

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..model.reconstruct import NEEDS_PASSES
+from ..model import baselines  # noqa: F401, adds its methods
+from ..model.methods import METHODS
 from .lpips import HINT
 from .protocol import TABLE
 from .provenance import Provenance
@@ -192,7 +193,8 @@ def table(metrics: dict) -> str:
 
 def sees(method: str) -> str:
     """What a method is given, for the tables."""
-    return "depth + motion" if method.split("+")[0] in NEEDS_PASSES else "RGB only"
+    known = METHODS.get(method.split("+")[0])
+    return "depth + motion" if known and known.has_depth else "RGB only"
 
 
 def results(metrics: dict) -> dict[tuple[int, str], dict[str, dict]]:

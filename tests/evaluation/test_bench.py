@@ -43,7 +43,7 @@ def test_labels():
     assert way.fit == 10 + SECONDS
     assert parse("guided+budget:5%").fit == SECONDS and parse("guided+refine:3+budget:5%").fit == 3
     way = parse("guided+refine:3")
-    assert way.fit == 3 and way.passes and not way.baseline and way.checkpoint is None
+    assert way.fit == 3 and way.has_depth and not way.baseline and way.checkpoint is None
     for label, says in (
         ("4dgs", "take seconds"),
         ("lift:3", "take seconds"),
@@ -183,7 +183,7 @@ def test_points_are_what_objects_allow(folders):
     for view in sequences["b"].views:
         view.passes = None
     points, notes = bench.plan(sequences)
-    assert not any(parse(p.label).passes for p in points) and "b has no depth" in notes[0]
+    assert not any(parse(p.label).has_depth for p in points) and "b has no depth" in notes[0]
     stages = [[p.label for p in s] for s in bench._stages(points)]
     assert [x for s in stages for x in s if x.endswith("30")] == [x for s in stages[-1:] for x in s]
 

@@ -90,15 +90,15 @@ def test_smaller_sizes_are_averages(sphere_folder):
     blocks = truth.picture.reshape(6, 16, 2, 16, 2, 3).mean((2, 4))
     assert torch.allclose(half.picture, blocks, atol=1e-6)
     assert torch.allclose(half.views.intrinsics * 2, truth.views.intrinsics)
-    with_passes, without = (load_inputs(seq, range(24), passes, 16) for passes in (True, False))
-    assert torch.equal(with_passes.rgb, without.rgb) and without.depth is None and with_passes.depth is not None
+    with_depth, without = (load_inputs(seq, range(24), depth, 16) for depth in (True, False))
+    assert torch.equal(with_depth.rgb, without.rgb) and without.depth is None and with_depth.depth is not None
     assert torch.allclose(without.over(1.0), load_truth(seq, range(24), [], 16).picture, atol=1e-5)
     with pytest.raises(InputError, match="do not shrink to 20"):
         load_inputs(seq, range(24), False, 20)
 
 
 def test_method_specs():
-    assert parse_method(" lift").passes and not parse_method("sweep").passes
+    assert parse_method(" lift").has_depth and not parse_method("sweep").has_depth
     both = parse_method("guided+refine:10+budget:10%+dense")
     assert (both.name, both.refine, both.budget, both.dense) == ("guided", 10.0, "10%", True)
     assert parse_method("lift+budget:auto").budget == "auto" and parse_method("lift+budget:500").refine is None

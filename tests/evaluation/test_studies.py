@@ -13,8 +13,8 @@ from timesplat.datagen import rigs
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.evaluation import ablations as compare
 from timesplat.evaluation import studies, subjects
+from timesplat.model.checkpoints_io import save_network
 from timesplat.model.network import Config, Network
-from timesplat.model.reconstruct import save_network
 
 FRAMES = list(range(24))
 

@@ -6,6 +6,7 @@ import torch
 
 from timesplat.model.baselines.four_dgs import POINTS, four_dgs
 from timesplat.model.baselines.visual_hull import white
+from timesplat.model.methods import ReconstructOptions
 from timesplat.model.reconstruct import reconstruct_views
 
 
@@ -32,5 +33,6 @@ def test_a_number_of_steps_gives_the_same_on_every_run_and_seconds_end(moving, s
     torch.testing.assert_close(a.xyz, b.xyz, rtol=0, atol=0)
     torch.testing.assert_close(a.opacity, b.opacity, rtol=0, atol=0)
     told = []
-    reconstruct_views(views, "4dgs", seconds=0.3, progress=lambda fraction, text: told.append((fraction, text)))
+    options = ReconstructOptions(seconds=0.3)
+    reconstruct_views(views, "4dgs", options, lambda fraction, text: told.append((fraction, text)))
     assert told == sorted(told) and told[-1] == (1, "4dgs, step 29")

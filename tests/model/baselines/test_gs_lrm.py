@@ -7,9 +7,11 @@ import torch
 from timesplat.datagen.sequence import InputError
 from timesplat.model.baselines.gs_lrm import all_in, per_frame
 from timesplat.model.baselines.visual_hull import white
+from timesplat.model.checkpoints_io import save_network
+from timesplat.model.methods import ReconstructOptions
 from timesplat.model.network import Config, Network
 from timesplat.model.rasterize import render
-from timesplat.model.reconstruct import reconstruct_views, save_network
+from timesplat.model.reconstruct import reconstruct_views
 
 
 @pytest.fixture(scope="module", params=["sweep", "predicted"])
@@ -26,9 +28,9 @@ def static(request, tmp_path_factory):
 @torch.inference_mode()
 def test_frames_know_nothing_of_each_other(spheres, static):
     views = spheres([0, 0, 6, 23], [(0, 0), (120, 20), (90, 0), (200, 0)], size=32)
-    scene = reconstruct_views(views, "gs-lrm-frame", checkpoint=static)
-    first = reconstruct_views(views[:2], "gs-lrm-frame", checkpoint=static)
-    last = reconstruct_views(views[3:], "gs-lrm-all", checkpoint=static)
+    scene = reconstruct_views(views, "gs-lrm-frame", ReconstructOptions(checkpoint=static))
+    first = reconstruct_views(views[:2], "gs-lrm-frame", ReconstructOptions(checkpoint=static))
+    last = reconstruct_views(views[3:], "gs-lrm-all", ReconstructOptions(checkpoint=static))
     assert len(scene) > len(first) + len(last) and len(first) > 100
     for t, alone in ((-1.0, first.at(0.7)), (0.9, last)):
         torch.testing.assert_close(scene.at(t).xyz, alone.xyz)
@@ -39,9 +41,9 @@ def test_frames_know_nothing_of_each_other(spheres, static):
 @torch.inference_mode()
 def test_collapsed_times_do_not_matter(spheres, static):
     views = spheres([0, 8, 16], size=32)
-    a = reconstruct_views(views, "gs-lrm-all", checkpoint=static)
+    a = reconstruct_views(views, "gs-lrm-all", ReconstructOptions(checkpoint=static))
     views.time = views.time.flip(0)
-    b = reconstruct_views(views, "gs-lrm-all", checkpoint=static)
+    b = reconstruct_views(views, "gs-lrm-all", ReconstructOptions(checkpoint=static))
     torch.testing.assert_close(a.xyz, b.xyz)
     torch.testing.assert_close(a.position(torch.tensor(-1.0)), a.position(torch.tensor(1.0)))
     assert a.marginal(torch.tensor(1.0)).min() > 0.999

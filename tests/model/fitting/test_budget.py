@@ -14,6 +14,7 @@ from timesplat.model.fitting.fit_views import squared_error
 from timesplat.model.fitting.merge import contribution
 from timesplat.model.geometry.lift import lift
 from timesplat.model.io.asset import read_ply
+from timesplat.model.methods import ReconstructOptions
 from timesplat.model.reconstruct import reconstruct_views
 
 
@@ -92,7 +93,7 @@ def test_as_part_of_a_reconstruction_and_from_the_command_line(
     monkeypatch.setattr(budget, "SECONDS", 0.3)
     monkeypatch.setattr(budget, "TRY_SECONDS", 0.1)
     with torch.inference_mode():
-        assert len(reconstruct_views(inputs, "lift", budget="300")) <= 300
+        assert len(reconstruct_views(inputs, "lift", ReconstructOptions(budget="300"))) <= 300
     folder = tmp_path / "spheres"
     write_views(inputs, folder, others)
     args = ["reconstruct", str(folder), "--method", "hull", "--out", str(tmp_path / "a.ply")]

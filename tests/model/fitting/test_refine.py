@@ -14,7 +14,6 @@ from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB, Few, part, refi
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
 from timesplat.model.io.asset import read_ply
-from timesplat.model.reconstruct import reconstruct_views
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +92,7 @@ def test_refusals(scene):
     inputs, _ = scene
     for seconds in (-1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="seconds of refinement: give 0 or more"):
-            reconstruct_views(inputs, "hull", refine=seconds)
+            refine(lift(inputs), inputs, seconds)
     with pytest.raises(InputError, match="of another kind"):
         refine(object(), inputs, 1.0)
 
