@@ -21,10 +21,8 @@ def test_what_methods_are():
     assert named(knows_surface=True) == {"lift", "guided", "rgb", "sweep"}
     assert named(fits=True) == {"4dgs", "som"}
     assert named(baseline=False) == {"lift", "guided", "rgb", "sweep"}
-    assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"} and named(checkpoint="sweep") == {
-        "rgb",
-        "sweep",
-    }
+    assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"}
+    assert named(checkpoint="sweep") == {"rgb", "sweep"}
     assert all(m.about.startswith("ours") != m.baseline for m in METHODS.values())
 
 
