@@ -134,38 +134,34 @@ def reconstruct(args: argparse.Namespace) -> int:
     import time
 
     from .datagen.sequence import read_sequence
-    from .model.fitting.budget import parse
-    from .model.fitting.refine import check_seconds
-    from .model.geometry.coverage import SURFACES, coverage
+    from .model import baselines  # noqa: F401, adds its methods
+    from .model.clip import clip_of
+    from .model.geometry.coverage import coverage
     from .model.io.asset import write_ply
-    from .model.reconstruct import NEEDS_PASSES, clip_of
+    from .model.methods import ReconstructOptions, method_named
     from .model.reconstruct import reconstruct as run
     from .model.views import load_views
 
     start = time.perf_counter()
-    check_seconds(args.refine)
-    if args.budget:
-        parse(args.budget)
-    seq = read_sequence(args.sequence)
-    rigs = sorted({v.rig for v in seq.views})
-    if args.rig and args.rig not in rigs:
-        raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
-    indices = seq.select(rig=args.rig) if args.rig else [i for i, v in enumerate(seq.views) if v.rig != "target"]
-    g = run(
-        seq,
-        args.method,
-        indices,
-        args.device,
-        args.checkpoint,
+    options = ReconstructOptions(
+        device=args.device,
+        checkpoint=args.checkpoint,
         seconds=args.seconds,
         refine=args.refine,
         budget=args.budget,
         max_loss=args.max_loss,
     )
+    seq = read_sequence(args.sequence)
+    rigs = sorted({v.rig for v in seq.views})
+    if args.rig and args.rig not in rigs:
+        raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
+    indices = seq.select(rig=args.rig) if args.rig else [i for i, v in enumerate(seq.views) if v.rig != "target"]
+    g = run(seq, args.method, indices, options)
     write_ply(args.out, g.to_asset(clip_of(seq)))
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {time.perf_counter() - start:.1f} s")
-    if args.method in SURFACES and not (args.refine or args.budget):
-        share, _ = coverage(g, load_views(seq, indices, args.method in NEEDS_PASSES))
+    method = method_named(args.method)
+    if method.knows_surface and not (args.refine or args.budget):
+        share, _ = coverage(g, load_views(seq, indices, method.has_depth))
         print(f"coverage {share:.0%}" + ("" if share > 0.99 else ": what no camera saw is left open"))
     return 0
 

@@ -30,8 +30,9 @@ from torch import nn
 from timesplat.datagen.sequence import read_sequence, sequences_in
 from timesplat.evaluation.image_quality import psnr
 from timesplat.evaluation.scoring import draw
+from timesplat.model.checkpoints_io import CHECKPOINTS, load_network
+from timesplat.model.inference import geometry_for
 from timesplat.model.network import PRESETS, Network
-from timesplat.model.reconstruct import CHECKPOINTS, geometry_for, load_network
 from timesplat.model.views import Views, load_views
 
 CASES = [("tiny", 24, 64), ("tiny", 24, 128), ("small", 24, 128), ("base", 12, 128), ("base", 24, 256)]
@@ -129,7 +130,7 @@ def objects(folders: list[Path]):
     """Name, input Views and held-out Views of every Sequence below the folders."""
     for found in [f for folder in folders for f in sequences_in(folder)]:
         seq = read_sequence(found)
-        inputs = load_views(seq, seq.select(rig="alternating"), passes=True)
+        inputs = load_views(seq, seq.select(rig="alternating"), has_depth=True)
         yield found.parent.name, inputs, load_views(seq, seq.select(rig="target"))
 
 

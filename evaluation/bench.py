@@ -123,7 +123,7 @@ def _check(options: BenchOptions) -> None:
 def measure(options: BenchOptions, started: float) -> list[str]:
     """Writes bench.csv; -> what could not be rendered."""
     from ..datagen.render_job import RenderSettings
-    from ..model.reconstruct import check_device
+    from ..model.devices import check_device
     from .bench_summary import bench_row, write_csv
     from .cache import Cache
     from .method_spec import parse_specs
@@ -220,9 +220,10 @@ def plan(
 
 def _other_weights() -> list[str]:
     """Methods with shipped checkpoints of other sizes, which are named METHOD-….safetensors."""
-    from ..model.reconstruct import CHECKPOINTS, WEIGHTS
+    from ..model.checkpoints_io import CHECKPOINTS
+    from ..model.methods import METHODS
 
-    names = [(n, WEIGHTS.get(n, n)) for n in ("guided", "rgb", "predicted")]
+    names = [(n, METHODS[n].checkpoint) for n in ("guided", "rgb", "predicted")]
     return [f"{n}@{f.stem[len(w) + 1 :]}" for n, w in names for f in sorted(CHECKPOINTS.glob(f"{w}-*.safetensors"))]
 
 

@@ -39,7 +39,7 @@ def contact_sheet(seq: Sequence, frames: int):
     name, indices = next(iter(shown.items()))
     whole = [i for i in indices if i is not None and seq.views[i].passes]
     if len(whole) == len(indices):
-        views = load_views(seq, whole, passes=True)
+        views = load_views(seq, whole, has_depth=True)
         assert views.depth is not None and views.flow is not None
         rows[f"depth, {name}"] = _depth(views.depth)
         rows[f"motion, {name}"] = _motion(views.flow[..., :2].nan_to_num(0).numpy())

@@ -43,9 +43,9 @@ def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
 
     from ..datagen.farm import render_shots
     from ..datagen.render_job import RenderSettings
+    from ..model.clip import clip_of
     from ..model.io.asset import write_ply
     from ..model.io.usd_write import write_usd
-    from ..model.reconstruct import clip_of
     from . import protocol
     from .cache import Cache
     from .method_spec import parse_spec

@@ -75,7 +75,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 def evaluate(options: EvaluateOptions) -> int:
     """The command; 2 where an asset could not be rendered, else 0. Raises InputError."""
     from ..datagen.render_job import RenderSettings
-    from ..model.reconstruct import check_device
+    from ..model.devices import check_device
     from .cache import Cache, find_sequences
     from .lpips import HINT, find_lpips
     from .method_spec import parse_specs

@@ -17,9 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..datagen.sequence import InputError
+from ..model import baselines  # noqa: F401 (they register themselves)
+from ..model.checkpoints_io import CHECKPOINTS
 from ..model.fitting.budget import SECONDS as BUDGET_SECONDS
-from ..model.fitting.budget import parse as parse_budget
-from ..model.reconstruct import CHECKPOINTS, FITTED, METHODS, NEEDS_PASSES, WEIGHTS
+from ..model.fitting.budget import parse_budget
+from ..model.methods import METHODS, method_named
 from .provenance import file_hash
 
 FORM = "[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+budget:N|P%|auto][+dense]"
@@ -45,12 +47,12 @@ class MethodSpec:
     @property
     def has_depth(self) -> bool:
         """Whether it sees depth and motion, not RGB and alpha alone."""
-        return self.method in NEEDS_PASSES
+        return METHODS[self.method].has_depth
 
     @property
     def baseline(self) -> bool:
         """Whether it is what ours are compared with."""
-        return not METHODS[self.method].startswith("ours")
+        return METHODS[self.method].baseline
 
     @property
     def fit_seconds(self) -> float:
@@ -59,9 +61,9 @@ class MethodSpec:
 
     @property
     def weights(self) -> Path | None:
-        """The checkpoint that it loads; None where there is none of the method's name."""
-        own = CHECKPOINTS / f"{WEIGHTS.get(self.method, self.method)}.safetensors"
-        return self.checkpoint or (own if own.is_file() else None)
+        """The checkpoint that it loads; None where it needs none."""
+        shipped = METHODS[self.method].checkpoint
+        return self.checkpoint or (CHECKPOINTS / f"{shipped}.safetensors" if shipped else None)
 
     @property
     def fingerprint(self) -> str:
@@ -77,10 +79,10 @@ def parse_spec(text: str, seconds: float | None = None, checkpoint: Path | None 
     if not match:
         raise InputError(f"{text.strip() or 'a method'}: write {FORM}, for example rgb+refine:4.")
     label, method, weights, own, options = match.groups()
-    if method not in METHODS:
-        raise InputError(f"{method}: no such method; choose from {', '.join(METHODS)}.")
-    if own and method not in FITTED:
-        raise InputError(f"{text}: {' and '.join(FITTED)}, and they alone, take seconds; write for example 4dgs:10.")
+    fits = method_named(method).fits
+    if own and not fits:
+        fitting = " and ".join(m.name for m in METHODS.values() if m.fits)
+        raise InputError(f"{text}: {fitting}, and they alone, take seconds; write for example 4dgs:10.")
     found: dict = {}
     for part in (options or "").split("+")[1:]:
         option = _OPTION.fullmatch(part)
@@ -90,10 +92,10 @@ def parse_spec(text: str, seconds: float | None = None, checkpoint: Path | None 
         found[name] = value
     if found.get("budget"):
         parse_budget(found["budget"])
-    if own is not None or method in FITTED:
-        seconds = float(own) if own else seconds
-    else:
+    if not fits:
         seconds = None
+    elif own:
+        seconds = float(own)
     chosen = _checkpoint(text, method, weights) if weights else checkpoint
     return MethodSpec(
         label=label or text.strip(),
@@ -116,7 +118,7 @@ def parse_specs(text: str, seconds: float | None = None, checkpoint: Path | None
 
 def _checkpoint(text: str, method: str, weights: str) -> Path:
     """The file named, or the shipped checkpoint METHOD-weights."""
-    shipped = CHECKPOINTS / f"{WEIGHTS.get(method, method)}-{weights}.safetensors"
+    shipped = CHECKPOINTS / f"{METHODS[method].checkpoint or method}-{weights}.safetensors"
     for path in (Path(weights), shipped):
         if path.is_file():
             return path

@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from ..datagen.sequence import InputError, Sequence
+from ..model.clip import clip_of
 from ..model.gaussians import Gaussians4D, Moving
-from ..model.geometry.coverage import SURFACES, coverage
+from ..model.geometry.coverage import coverage
 from ..model.io.asset import write_ply
+from ..model.methods import METHODS, ReconstructOptions
 from ..model.parallel import clock
 from ..model.rasterize import render
 from ..model.rasterize.timeline import WORTH, Timeline
-from ..model.reconstruct import clip_of, reconstruct_views
+from ..model.reconstruct import reconstruct_views
 from ..model.views import Views
 from .loading import Truth
 from .method_spec import MethodSpec
@@ -29,9 +31,17 @@ def reconstruct(views: Views, method: MethodSpec, device: str = "cpu", seconds: 
     method that fits the scene and names none."""
     with torch.no_grad():  # methods that fit a scene turn gradients on again
         return reconstruct_views(
-            views, method.method, device, method.checkpoint, method.seconds or seconds,
-            refine=method.refine or 0.0, budget=method.budget, dense=method.dense,
-        )  # fmt: skip
+            views,
+            method.method,
+            ReconstructOptions(
+                device=device,
+                checkpoint=method.checkpoint,
+                seconds=method.seconds or seconds,
+                refine=method.refine or 0.0,
+                budget=method.budget,
+                dense=method.dense,
+            ),
+        )
 
 
 def draw(scene: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
@@ -74,7 +84,7 @@ def costs(scene: Gaussians4D | Moving, views: Views, truth: Truth, method: Metho
     start = clock()
     draw(scene, truth.views)
     drawing = 1000 * (clock() - start) / len(truth.picture)
-    known = method.method in SURFACES and not (method.refine or method.budget or method.dense)
+    known = METHODS[method.method].knows_surface and not (method.refine or method.budget or method.dense)
     sizes = megabytes(scene, seq)
     return dict(zip(COSTS, (*sizes, drawing, coverage(scene, views)[0] if known else None), strict=True))
 

@@ -90,7 +90,7 @@ def _packages(s) -> str:
 def _device(s) -> str:
     import torch
 
-    from .reconstruct import check_device
+    from .devices import check_device
 
     check_device(s.device)
     if s.device.startswith("cuda"):
@@ -123,7 +123,7 @@ def _lift(s) -> str:
 
 
 def _checkpoints(s) -> str:
-    from .reconstruct import CHECKPOINTS, load_network
+    from .checkpoints_io import CHECKPOINTS, load_network
 
     files = [Path(s.checkpoint)] if s.checkpoint else sorted(CHECKPOINTS.glob("*.safetensors"))
     if not files:
@@ -182,11 +182,12 @@ def _reconstruct(s, method: str, refine: float = 0.0, judged: bool = True):
     import torch
 
     from .rasterize import render
-    from .reconstruct import reconstruct
+    from .reconstruct import ReconstructOptions, reconstruct
 
     start = time.monotonic()
     checkpoint = s.checkpoint if method == "guided" else None
-    scene = reconstruct(s.sequence, method, device=s.device, checkpoint=checkpoint, refine=refine)
+    options = ReconstructOptions(device=s.device, checkpoint=checkpoint, refine=refine)
+    scene = reconstruct(s.sequence, method, options=options)
     seconds = time.monotonic() - start
     c2w, intrinsics = _sequence([HELD_OUT]).cameras()
     moment = torch.tensor(s.sequence.times()[[HELD_OUT.frame]])

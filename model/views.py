@@ -49,8 +49,9 @@ class Views:
         return self.rgb * a + background * (1 - a)
 
 
-def load_views(seq: Sequence, indices, passes: bool = False) -> Views:
-    """The views of a Sequence at `indices`. Raises InputError for a missing or damaged image or pass."""
+def load_views(seq: Sequence, indices, has_depth: bool = False) -> Views:
+    """The views of a Sequence at `indices`, has_depth: with depth and flow. Raises InputError for a missing or damaged
+    image or pass."""
     rgba = torch.from_numpy(np.stack([seq.load_image(i) for i in indices])).float() / 255
     c2w, intrinsics = seq.cameras(indices)
     views = Views(
@@ -61,7 +62,7 @@ def load_views(seq: Sequence, indices, passes: bool = False) -> Views:
         time=torch.from_numpy(seq.times(indices)),
         frame_step=2 / max(seq.frame_end - seq.frame_start, 1),
     )
-    if passes:
+    if has_depth:
         p = [seq.load_passes(i) for i in indices]
         views.depth = torch.from_numpy(np.stack([x.depth for x in p]))
         views.flow = torch.from_numpy(np.stack([np.concatenate([x.flow_next, x.flow_prev], -1) for x in p]))

@@ -106,33 +106,29 @@ def _reconstruct(request: dict, progress) -> dict:
         raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
     from .io.asset import write_ply
 
-    method, refine, budget = request.get("method", "guided"), request.get("refine", 0.0), request.get("budget")
-    if not (refine or budget or method in ("4dgs", "som")):
+    refine, budget, checkpoint = request.get("refine", 0.0), request.get("budget"), request.get("checkpoint")
+    if not (refine or budget):
         # A third of torch's start-up: what shapes its operations return, for compilers. What fits uses
         # torch.optim, which loads them.
         sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
-    from .reconstruct import clip_of, reconstruct  # imports torch
+    from .clip import clip_of
+    from .reconstruct import ReconstructOptions, reconstruct  # imports torch
 
-    if refine or budget:  # refuse now what else is found out after seconds
-        from .fitting.budget import parse
-        from .fitting.refine import check_seconds
-
-        check_seconds(refine)
-        if budget:
-            parse(budget)
-    checkpoint = request.get("checkpoint")
+    options = ReconstructOptions(
+        device=request.get("device", "cpu"),
+        checkpoint=Path(checkpoint) if checkpoint else None,
+        refine=refine,
+        budget=budget,
+        max_loss=max_loss,
+    )
     compiled = any(Path(__file__).parent.rglob("__pycache__/*.nbi"))  # numba's, of an earlier run
     note = "" if compiled else "; the first run compiles, which takes half a minute"
     gaussians = reconstruct(
         sequence,
-        method,
-        indices=indices,
-        device=request.get("device", "cpu"),
-        checkpoint=Path(checkpoint) if checkpoint else None,
+        request.get("method", "guided"),
+        indices,
+        options,
         progress=lambda fraction, text: progress(0.05 + 0.9 * fraction, text + note),
-        refine=refine,
-        budget=budget,
-        max_loss=max_loss,
     )
     if len(gaussians) == 0:
         raise InputError(f"{sequence.root}: nothing was found to reconstruct; check that views show the object.")

@@ -23,11 +23,11 @@ LAYERS = {
     "model": (
         ("model.io",),
         ("model.parallel", "model.rotations", "model.devices"),
-        ("model.gaussians", "model.views"),
+        ("model.gaussians", "model.views", "model.clip"),
         ("model.rasterize",),
         ("model.geometry",),
         ("model.network", "model.hexplane"),
-        ("model.checkpoints_io",),
+        ("model.checkpoints_io", "model.inference"),
         ("model.fitting",),
         ("model.methods",),
         ("model.reconstruct",),
@@ -71,7 +71,7 @@ LAYERS = {
     ),
 }
 # What the product, all of `model` but these, does not know; they may use every layer up to the one named.
-ASIDE = {"model.baselines": "model.methods", "model.training": "model.checkpoints_io"}
+ASIDE = {"model.baselines": "model.methods", "model.training": "model.inference"}
 
 
 def room_of(name: str) -> str:

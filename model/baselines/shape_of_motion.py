@@ -20,7 +20,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...datagen.sequence import InputError
-from ..fitting.loop import COARSE, Parameters, Step, gradients, optimise, own, photographs, shrunk
+from ..fitting.fit_views import detached, downsampled, reduction
+from ..fitting.loop import COARSE, Schedule, Step, gradients, optimise, photometric_loss
+from ..fitting.parameters import Parameters
 from ..gaussians import Gaussians4D
 from ..geometry.plane_sweep import sweep_geometry
 from ..io.asset import Clip
@@ -109,76 +111,92 @@ def clusters(points: Tensor, count: int, generator) -> Tensor:
     return centre
 
 
-def som(
+def shape_of_motion(
     views: Views, device: str = "cpu", seconds: float = 10.0, steps: int | None = None, seed: int = 0, progress=None
 ) -> Motion | Gaussians4D:
     """Views (RGB and alpha alone are used) -> Motion on the CPU, after `seconds`, or `steps` where given; where
     no view shows the object, nothing (`white`). For `progress` see `optimise`."""
     start = clock()
     with gradients():
-        views = own(views)
+        views = detached(views)
         generator = torch.Generator().manual_seed(seed)
         g = canonical(views, generator)
         if not len(g):
             return white(views)
-        centre = clusters(g.xyz, min(BASES, len(g)), generator)
-        away = torch.cdist(g.xyz, centre).square()
         moments = views.time.unique()
-        raw = {
-            "xyz": g.xyz,
-            "scale": g.scale.log(),
-            "rotation": g.rotation,
-            "rgb": g.rgb,
-            "opacity": g.opacity.logit(),
-            "blend": -away / away.amin(1).mean().clamp_min(1e-6),
-            "bases": 1e-3 * torch.randn(len(moments), len(centre), 7, generator=generator),
-        }
+        raw = starting_point(g, len(moments), generator)
         p = Parameters({k: x.to(device) for k, x in raw.items()}, RATES)
         moments, views = moments.to(device), views.to(device)
         smooth = torch.exp(-0.5 * ((moments[:, None] - moments) / (WIDTH * views.frame_step)) ** 2)
         smooth = smooth / smooth.sum(1, keepdim=True)
-        anchors = torch.randperm(len(g), generator=generator)[:ANCHORS]
-        near = torch.cdist(g.xyz[anchors], g.xyz).topk(min(7, len(g)), largest=False).indices[:, 1:]
-        anchors, near = anchors.to(device), near.to(device)
+        rigidity = Rigidity(g.xyz, device, generator)
 
         def loss(step: Step) -> Tensor:
             bases = step.scene.bases
-            out = photographs(step)
+            out = photometric_loss(step)
             if len(bases) > 2:
                 out = out + ACCELERATION * (bases[2:] - 2 * bases[1:-1] + bases[:-2]).square().mean()
             # At a moment at random, neighbours keep their distance.
             pose = step.scene.blend @ bases[int(torch.randint(len(bases), (), generator=generator))]
-            rest, at = (
-                (x[near] - x[anchors][:, None]).square().sum(-1).add(1e-12).sqrt()
-                for x in (p["xyz"], moved(p["xyz"], pose)[0])
-            )
-            return out + RIGID * (at - rest).square().mean()
+            return out + RIGID * rigidity.loss(p["xyz"], moved(p["xyz"], pose)[0])
 
-        left = seconds - (clock() - start)
         optimise(
             p,
             lambda: activate(p.values, moments, smooth),
             views,
             loss,
-            left,
-            steps=steps,
-            seed=seed,
+            Schedule(seconds=seconds - (clock() - start), steps=steps, seed=seed),
             text="som",
             progress=progress,
         )
         return activate({k: x.detach() for k, x in p.values.items()}, moments, smooth).to("cpu")
 
 
+def starting_point(g: Gaussians4D, moments: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Raw parameters of the canonical Gaussians (N,) and of BASES (fewer, where there are fewer Gaussians) at rest at
+    so many moments, each Gaussian with most of the bases whose cluster it lies next to."""
+    centre = clusters(g.xyz, min(BASES, len(g)), generator)
+    away = torch.cdist(g.xyz, centre).square()
+    return {
+        "xyz": g.xyz,
+        "scale": g.scale.log(),
+        "rotation": g.rotation,
+        "rgb": g.rgb,
+        "opacity": g.opacity.logit(),
+        "blend": -away / away.amin(1).mean().clamp_min(1e-6),
+        "bases": 1e-3 * torch.randn(moments, len(centre), 7, generator=generator),
+    }
+
+
+class Rigidity:
+    """Distances of ANCHORS, chosen among points (N,3) at random, to their six nearest neighbours."""
+
+    def __init__(self, points: Tensor, device: str, generator: torch.Generator):
+        anchors = torch.randperm(len(points), generator=generator)[:ANCHORS]
+        count = min(7, len(points))
+        nearest = torch.cdist(points[anchors], points).topk(count, largest=False).indices[:, 1:]
+        self.anchors, self.nearest = anchors.to(device), nearest.to(device)
+
+    def distances(self, xyz: Tensor) -> Tensor:
+        """(A,6) of the points as they are at xyz (N,3)."""
+        return (xyz[self.nearest] - xyz[self.anchors][:, None]).square().sum(-1).add(1e-12).sqrt()
+
+    def loss(self, before: Tensor, after: Tensor) -> Tensor:
+        """() mean square of how much the distances differ between two states of the points (N,3)."""
+        rest, now = self.distances(before), self.distances(after)
+        return (now - rest).square().mean()
+
+
 def canonical(views: Views, generator: torch.Generator) -> Gaussians4D:
     """POINTS of the sweep's points (all, where there are fewer) in the WINDOW views nearest to the middle of the
     clip that show the object, round, unmoving, larger for being fewer."""
     shown = (views.alpha.flatten(1).amax(1) > 0.5).nonzero()[:, 0]
-    views = shrunk(views[shown], -(-max(views.size) // COARSE))
+    views = downsampled(views[shown], reduction(views, COARSE))
     middle = views.time.sort().values[len(views) // 2] if len(views) else 0.0
-    near = views[(views.time - middle).abs().argsort(stable=True)[:WINDOW]]
-    if not len(near):
+    closest = views[(views.time - middle).abs().argsort(stable=True)[:WINDOW]]
+    if not len(closest):
         return white(views)
-    g = sweep_geometry(near).gaussians
+    g = sweep_geometry(closest).gaussians
     chosen = torch.randperm(len(g), generator=generator)[:POINTS]
     grow = 0.7 * (len(g) / max(len(chosen), 1)) ** 0.5
     g = g[chosen].frozen(0.0)

@@ -18,7 +18,7 @@ def white(views: Views) -> Gaussians4D:
     return Gaussians4D(**{k: torch.zeros(shapes.get(k, (0,))) for k in FIELDS})
 
 
-def hull(views: Views) -> Gaussians4D:
+def visual_hull(views: Views) -> Gaussians4D:
     """Per moment, the surface voxels inside the silhouettes of the WINDOW views closest in time, in the
     mean colour of the object; each moment's voxels live for about one frame."""
     axis = (torch.arange(GRID) + 0.5) / GRID * 2 - 1

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """No more Gaussians than a scene needs: a number, a share of those predicted, or as many as keep within a loss.
 
-The Gaussians wanted are fused from those predicted and fitted for some seconds (`refine.py`), so that a budget
+The Gaussians wanted are merged from those predicted and fitted for some seconds (`refine.py`), so that a budget
 costs quality only where the scene has more in it. `auto` looks for the fewest: short fits with more and more of
 them, until twice as many would not bring the loss that is allowed back, on input views that were held out.
 """
@@ -16,18 +16,19 @@ import torch
 from ...datagen.sequence import InputError
 from ..gaussians import Gaussians4D, Moving
 from ..views import Views
-from .loop import gradients, own
+from .fit_views import detached, squared_error, validation_views, views_around
+from .loop import Schedule, gradients
 from .merge import contribution
-from .refine import PIXELS, RATES, around, error, few, fit, judging, limit, part, refine
+from .refine import Few, enlargement, fit_few, part, refine
 
 SECONDS = 5.0  # of fitting, where none are asked for, at 128²; in proportion to the pixels above
-FEWEST = 500  # Gaussians to try first; then twice as many, and so on
-TRIAL = 1.5  # seconds of each try
-LEAST = 1.0  # pixels that a Gaussian must contribute in all of AROUND pictures together: a twentieth do not
-HELD = 6  # input views that are held out
+FIRST_TRY = 500  # Gaussians; then twice as many, and so on
+TRY_SECONDS = 1.5
+MIN_CONTRIBUTION = 1.0  # pixels of a Gaussian in all of the pictures from around together: a twentieth have less
+HELD_OUT = 6  # input views
 
 
-def parse(text: str) -> int | float | None:
+def parse_budget(text: str) -> int | float | None:
     """A number as it is, a share "P%" as P / 100, "auto" as None. Raises InputError for anything else."""
     if text == "auto":
         return None
@@ -40,61 +41,64 @@ def parse(text: str) -> int | float | None:
     raise InputError(f"{text}: no budget; give a number of Gaussians, a share such as 10%, or auto.")
 
 
-def reduced(
+def apply_budget(
     start: Gaussians4D | Moving,
     views: Views,
     budget: str,
     seconds: float = 0.0,
     *,
-    near: bool,
+    has_depth: bool,
     max_loss: float = 0.1,
     device: str = "cpu",
     progress=None,
 ) -> Gaussians4D:
-    """A prediction `start` from these views (`near`: with depth and motion) -> no more Gaussians than `budget` says,
-    refined for `seconds`, or SECONDS where 0; nor more than refinement uses by itself, but for auto. Raises
-    InputError, also for a scene that is not of 4D Gaussians."""
-    wanted, search = parse(budget), 0.0
+    """A prediction `start` (N,) from these views (has_depth: with depth and motion) -> no more Gaussians than `budget`
+    says, refined for `seconds`, or SECONDS where 0; nor more than refinement uses by itself, but for auto, which
+    keeps within `max_loss` dB. Raises InputError, also for a scene that is not of 4D Gaussians."""
+    wanted, search = parse_budget(budget), 0.0
     if wanted is None and isinstance(start, Gaussians4D):
         search = 0.5  # of what is reported
-        wanted, _ = fewest(start, views, max_loss, near=near, device=device, progress=part(progress, 0, search))
+        told = part(progress, 0, search)
+        wanted, _ = find_fewest(start, views, max_loss, has_depth=has_depth, device=device, progress=told)
     elif isinstance(start, Gaussians4D):
         share = wanted * int(start.alive().sum()) if isinstance(wanted, float) else wanted
-        wanted = max(min(int(share), limit(views, near)), 1)
+        wanted = max(min(int(share), Few.of(has_depth).limit(views)), 1)
     told = part(progress, search, 1)
-    seconds = seconds or SECONDS * max(views.alpha[0].numel() / PIXELS, 1.0)
-    g = refine(start, views, seconds, device, near=near, count=wanted, progress=told)
+    seconds = seconds or SECONDS * max(enlargement(views), 1.0)
+    g = refine(start, views, seconds, device, has_depth=has_depth, max_gaussians=wanted, progress=told)
     with gradients():
         g = g.map(torch.clone)
         if len(g) == 0:
             return g
-        seen = contribution(g, around(g, own(views)))
+        seen = contribution(g, views_around(g, detached(views)))
         if wanted and len(g) > wanted:  # a fit that was cut short had split some and not yet dropped others
             keep = seen.topk(wanted).indices
             g, seen = g[keep], seen[keep]
-        return g[seen > LEAST]
+        return g[seen > MIN_CONTRIBUTION]
 
 
-def fewest(
-    start: Gaussians4D, views: Views, max_loss: float, *, near: bool, device: str = "cpu", progress=None
+def find_fewest(
+    start: Gaussians4D, views: Views, max_loss: float, *, has_depth: bool, device: str = "cpu", progress=None
 ) -> tuple[int, list[tuple[int, float]]]:
-    """-> the fewest Gaussians that come within `max_loss` dB of twice as many, after fits of TRIAL seconds, on HELD of
-    the input views, which are not fitted; and what was tried: (number, PSNR in dB there)."""
+    """-> the fewest Gaussians that come within `max_loss` dB of twice as many, after fits of TRY_SECONDS, on HELD_OUT
+    input views, which are not fitted; and what was tried: (number, PSNR in dB there). Raises InputError for a
+    `max_loss` that is not above 0."""
     if not max_loss > 0:
         raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
-        g, views = g[g.alive()].with_axes(), own(views, device)
-        held = judging(views, min(HELD, max(len(views) // 4, 1))).tolist()
-        seen, unseen = views[[i for i in range(len(views)) if i not in held] or held], views[held]
-        beside = around(g, views) if near else None
+        g, views = g[g.alive()].with_axes(), detached(views, device)
+        held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
+        fitted, unseen = views[[i for i in range(len(views)) if i not in held_out] or held_out], views[held_out]
+        extra_views = views_around(g, views) if has_depth else None
+        schedule = Schedule(seconds=TRY_SECONDS, coarse_size=None)
         tried: list[tuple[int, float]] = []
-        number = FEWEST
+        number = FIRST_TRY
         while number < len(g):
             told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
-            values, price = few(g, number, near)
-            _, fitted = fit(values, RATES, seen, TRIAL, beside=beside, most=number, price=price, progress=told)
-            tried.append((number, -10 * math.log10(max(error(fitted, unseen), 1e-10))))
+            few = Few.of(has_depth)
+            _, scene = fit_few(g, number, few, fitted, schedule, extra_views=extra_views, progress=told)
+            tried.append((number, -10 * math.log10(max(squared_error(scene, unseen), 1e-10))))
             if len(tried) > 1 and tried[-1][1] - tried[-2][1] <= max_loss:
                 return tried[-2][0], tried
             number *= 2

@@ -1,98 +1,48 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fitting a scene to its views by gradient descent, for a number of seconds: the loop that per-scene methods
-share. What the scene is made of, and how, is the caller's; any `Moving` scene or Gaussians4D will do.
-
-The parameters are rows of raw tensors with Adam's moments beside, so that Gaussians can be added and taken
-away between steps.
-"""
+share. What the scene is made of, and how, is the caller's; any `Moving` scene or Gaussians4D will do."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
 from ..gaussians import Gaussians4D, Moving
 from ..parallel import clock
 from ..rasterize import render
-from ..views import Views, pad_to_multiple
+from ..views import Views
+from .fit_views import downsampled, joined, reduction
+from .parameters import Parameters
 
-BETAS, EPSILON = (0.9, 0.99), 1e-10  # Adam's; a shorter memory than usual, for hundreds of steps
-MASK = 0.3  # weight of the error in alpha against that in colour
+ALPHA_WEIGHT = 0.3  # of the error in alpha against that in colour
 COARSE, COARSE_UNTIL = 160, 0.6  # longest side in pixels of what is drawn in this first part of the budget
-OWN = (0.2, 0.8)  # share of a step's views that are photographs, at the start and at the end, where there are others
+PHOTO_SHARE = (0.2, 0.8)  # share of a step's views that are photographs, at the start and the end, beside extra views
 
 
-class Parameters:
-    """Raw tensors by name, each with Adam's moments and a learning rate that decays exponentially.
+@dataclass(frozen=True)
+class Schedule:
+    """How long a fit goes on, and what its steps draw."""
 
-    `parameters[name]` is the leaf that gradients reach."""
+    seconds: float = 0.0
+    steps: int | None = None  # exactly so many, in place of seconds: then the result is the same on every run
+    max_steps: int | None = None  # time that is left after these stays unused
+    batch: int = 2  # views of a step
+    coarse_size: int | None = COARSE  # longest side in pixels of the pictures at first; None: as they are, always
+    seed: int = 0
 
-    def __init__(self, values: dict[str, Tensor], rates: dict[str, tuple[float, float]]):
-        """values: name -> tensor of any shape; rates: name -> learning rate at the start and at the end of the
-        budget."""
-        self.rates = rates
-        self.values = {k: v.detach().clone().requires_grad_() for k, v in values.items()}
-        self.moments = {k: (torch.zeros_like(v), torch.zeros_like(v)) for k, v in self.values.items()}
-        self.steps = 0
-
-    def __getitem__(self, name: str) -> Tensor:
-        return self.values[name]
-
-    @torch.no_grad()
-    def step(self, fraction: float) -> None:
-        """One step of Adam (Kingma and Ba 2015) along the gradients, `fraction` 0..1 of the budget being spent.
-        Entries whose gradient is not finite count as 0."""
-        self.steps += 1
-        a, b = BETAS
-        for k, v in self.values.items():
-            first, last = self.rates[k]
-            if v.grad is None or first == 0:
-                continue
-            g, (m, s) = v.grad.nan_to_num_(0, 0, 0), self.moments[k]
-            m.lerp_(g, 1 - a)
-            s.mul_(b).addcmul_(g, g, value=1 - b)
-            scale = first * (last / first) ** fraction / (1 - a**self.steps)
-            v.addcdiv_(m, (s / (1 - b**self.steps)).sqrt_().add_(EPSILON), value=-scale)
-            v.grad = None
-
-    @torch.no_grad()
-    def rows(self, keep: Tensor, names=None) -> None:
-        """Keeps the rows `keep` (index or mask, repeats allowed) of the tensors `names` (all by default), with
-        their gradients and moments."""
-        for k in names or self.values:
-            old = self.values[k]
-            self.values[k] = old.detach()[keep].clone().requires_grad_()
-            self.values[k].grad = None if old.grad is None else old.grad[keep]
-            self.moments[k] = tuple(m[keep].clone() for m in self.moments[k])
-
-    @torch.no_grad()
-    def forget(self, rows: Tensor, names=None) -> None:
-        """Sets Adam's moments of these rows to 0, as for newly made ones."""
-        for k in names or self.values:
-            for m in self.moments[k]:
-                m[rows] = 0
-
-
-class Turns:
-    """Numbers first..last-1, all in turn, in a new random order each time."""
-
-    def __init__(self, first: int, last: int, generator: torch.Generator):
-        self.first, self.last, self.generator, self.order = first, last, generator, []
-
-    def take(self, n: int) -> list[int]:
-        while len(self.order) < n:
-            order = torch.randperm(self.last - self.first, generator=self.generator)
-            self.order += [self.first + i for i in order.tolist()]
-        taken, self.order = self.order[:n], self.order[n:]
-        return taken
+    def fraction(self, elapsed: float, done: int) -> float:
+        """The share 0..1 of the budget that is spent after `elapsed` seconds and `done` steps."""
+        spent, budget = (elapsed, self.seconds) if self.steps is None else (done, self.steps)
+        if budget <= 0:
+            return 1.0
+        return min(max(spent / budget, done / self.max_steps if self.max_steps else 0.0), 1.0)
 
 
 @dataclass
@@ -114,41 +64,115 @@ def gradients():
         yield
 
 
-def own(views: Views, device="cpu") -> Views:
-    """The views' colour, alpha, cameras and times copied to a device: free of inference mode."""
-    names = ("rgb", "alpha", "c2w", "intrinsics", "time")
-    return replace(views, depth=None, flow=None, **{k: getattr(views, k).to(device).clone() for k in names})
-
-
-def joined(a: Views, b: Views) -> Views:
-    """The views of `a`, then those of `b`, of the same size; as from `own`."""
-    names = ("rgb", "alpha", "c2w", "intrinsics", "time")
-    return replace(a, **{k: torch.cat([getattr(a, k), getattr(b, k)]) for k in names})
-
-
-def photographs(step: Step) -> Tensor:
-    """Mean absolute error of colours and, at MASK of its weight, of alpha."""
+def photometric_loss(step: Step) -> Tensor:
+    """() mean absolute error of colours and, at ALPHA_WEIGHT, of alpha."""
     error = (step.rgb - step.views.over(step.background)).abs().mean()
-    return error + MASK * (step.alpha - step.views.alpha).abs().mean()
+    return error + ALPHA_WEIGHT * (step.alpha - step.views.alpha).abs().mean()
 
 
-def shrunk(views: Views, by: int) -> Views:
-    """The views (without depth and flow) at 1/by of their size, rounded up; colours averaged as light is."""
-    if by == 1:
-        return views
-    views = pad_to_multiple(views, by)
+class _Turns:
+    """Numbers first..last-1, all in turn, in a new random order each time."""
 
-    def mean(x: Tensor) -> Tensor:  # (V,H,W,C)
-        return F.avg_pool2d(x.movedim(-1, 1), by).movedim(1, -1)
+    def __init__(self, first: int, last: int, generator: torch.Generator):
+        self.first, self.last, self.generator, self.order = first, last, generator, []
 
-    a = views.alpha[..., None]
-    alpha = mean(a)
-    rgb = mean(views.rgb * a) / alpha.clamp_min(1e-6)
-    return replace(views, rgb=rgb, alpha=alpha[..., 0], intrinsics=views.intrinsics / by)
+    def take(self, n: int) -> list[int]:
+        while len(self.order) < n:
+            order = torch.randperm(self.last - self.first, generator=self.generator)
+            self.order += [self.first + i for i in order.tolist()]
+        taken, self.order = self.order[:n], self.order[n:]
+        return taken
+
+
+class _Batches:
+    """The views of each step, all in turn in random order, and what is behind them: a random colour. Of extra views
+    there are fewer and fewer in a step."""
+
+    def __init__(self, views: Views, extra_views: Views | None, schedule: Schedule):
+        count, self.extra, self.size = len(views), extra_views is not None, schedule.batch
+        self.views = joined(views, extra_views) if self.extra else views
+        self.coarse = downsampled(self.views, reduction(self.views, schedule.coarse_size or max(self.views.size)))
+        self.generator = torch.Generator().manual_seed(schedule.seed)
+        self.photographs = _Turns(0, count, self.generator)
+        self.others = _Turns(count, len(self.views), self.generator)
+
+    def take(self, fraction: float) -> tuple[Views, Tensor]:
+        """-> the views, and the background (3,)."""
+        count = self.size
+        if self.extra:
+            first, last = PHOTO_SHARE
+            share = first + (last - first) * fraction
+            count = int((torch.rand(self.size, generator=self.generator) < share).sum())
+        chosen = self.photographs.take(count) + self.others.take(self.size - count)
+        views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
+        return views, torch.rand(3, generator=self.generator).to(views.rgb)
+
+
+class _Report:
+    """Tells the callback about ten times a second how far a fit is; without one a bar shows on a terminal after two
+    seconds."""
+
+    def __init__(self, text: str, progress: Callable[[float, str], None] | None):
+        self.text, self.progress, self.told = text, progress, 0.0
+        self.bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
+
+    def __call__(self, fraction: float, elapsed: float, done: int) -> None:
+        if elapsed - self.told <= 0.1 and fraction < 1:
+            return
+        self.told = elapsed
+        self.bar.update(math.floor(100 * fraction) - self.bar.n)
+        if self.progress:
+            self.progress(fraction, f"{self.text}, step {done}")
+
+
+def draw(scene: Gaussians4D | Moving, views: Views, background: Tensor, fraction: float) -> Step:
+    """The scene as the views' cameras see it over `background` (3,), with gradients."""
+    height, width = views.size
+    camera = (views.c2w, views.intrinsics, views.time, width, height)
+    rgb, alpha = render(scene, *camera, background=background)
+    return Step(rgb, alpha, views, background, scene, fraction)
+
+
+def optimise(
+    parameters: Parameters,
+    scene: Callable[[], Gaussians4D | Moving],
+    views: Views,
+    loss: Callable[[Step], Tensor],
+    schedule: Schedule,
+    *,
+    extra_views: Views | None = None,
+    after_backward: Callable[[int, float], None] | None = None,
+    text: str = "optimising",
+    progress: Callable[[float, str], None] | None = None,
+) -> int:
+    """Takes steps of Adam as `schedule` says; returns how many.
+
+    A step draws `scene()` from a few of the views over a random colour, and descends on `loss(step)`. `extra_views`,
+    where given, make up the rest of a step's share PHOTO_SHARE of `views`. `after_backward(number, fraction)` may
+    change the parameters' rows after a step, while their gradients are still there. `progress(fraction, text)` is
+    called about ten times a second. Call inside of `gradients()`, with views from `detached`."""
+    batches = _Batches(views, extra_views, schedule)
+    if schedule.steps is None:
+        warm_up(views.rgb.device.type)
+    start, done = clock(), 0
+    report = _Report(text, progress)
+    while True:
+        elapsed = clock() - start
+        fraction = schedule.fraction(elapsed, done)
+        report(fraction, elapsed, done)
+        if fraction >= 1:
+            report.bar.close()
+            return done
+        seen, background = batches.take(fraction)
+        loss(draw(scene(), seen, background, fraction)).backward()
+        done += 1
+        if after_backward:
+            after_backward(done, fraction)
+        parameters.step(fraction)
 
 
 @cache
-def ready(device: str) -> None:
+def warm_up(device: str) -> None:
     """Draws one Gaussian and takes one step, so that whoever counts seconds afterwards does not count the compiling of
     the kernels: half a minute the first time after an installation, loading them then."""
     with gradients():
@@ -160,70 +184,5 @@ def ready(device: str) -> None:
         def scene() -> Gaussians4D:
             return Gaussians4D(p["xyz"], 0 * one, 0 * three, one, three, turn, 0.5 * three, 0.5 * one)
 
-        optimise(p, scene, views, photographs, 0.0, steps=1, batch=1)
+        optimise(p, scene, views, photometric_loss, Schedule(steps=1, batch=1))
         render(scene(), views.c2w, views.intrinsics, views.time, 8, 8, inference=True)
-
-
-def optimise(
-    parameters: Parameters,
-    scene: Callable[[], Gaussians4D | Moving],
-    views: Views,
-    loss: Callable[[Step], Tensor],
-    seconds: float,
-    *,
-    steps: int | None = None,
-    enough: int | None = None,
-    beside: Views | None = None,
-    batch: int = 2,
-    coarse: int = COARSE,
-    edit: Callable[[int, float], None] | None = None,
-    background: Tensor | None = None,
-    seed: int = 0,
-    text: str = "optimising",
-    progress: Callable[[float, str], None] | None = None,
-) -> int:
-    """Takes steps of Adam until `seconds` are over, or exactly `steps` of them where given (then the result is
-    the same on every run); returns how many.
-
-    A step draws `scene()` from `batch` views (all views in turn, in random order) over `background` (3,) or
-    a random colour, pictures larger than `coarse` pixels averaged down at first, and descends on `loss(step)`.
-    After `enough` steps, where given, time that is left stays unused. Views `beside`, where given, make up the rest
-    of a step's share OWN of `views`.
-    `edit(number, fraction)` may change the parameters' rows after a step, while their gradients are still there.
-    `progress(fraction, text)` is called about ten times a second; without it a bar shows on a terminal after
-    two seconds. Call inside of `gradients()`, with views from `own`."""
-    generator = torch.Generator().manual_seed(seed)
-    count = len(views)
-    views = joined(views, beside) if beside else views
-    small = shrunk(views, -(-max(views.size) // coarse))
-    turns = Turns(0, count, generator), Turns(count, len(views), generator)
-    if steps is None:
-        ready(views.rgb.device.type)
-    start, told, done = clock(), 0.0, 0
-    bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
-    while True:
-        elapsed = clock() - start
-        spent, most = (elapsed, seconds) if steps is None else (done, steps)
-        fraction = max(spent / most, done / enough if enough else 0.0) if most > 0 else 1.0
-        fraction = min(fraction, 1.0)
-        if elapsed - told > 0.1 or fraction >= 1:
-            told = elapsed
-            bar.update(math.floor(100 * fraction) - bar.n)
-            if progress:
-                progress(fraction, f"{text}, step {done}")
-        if fraction >= 1:
-            break
-        share = OWN[0] + (OWN[1] - OWN[0]) * fraction
-        mine = int((torch.rand(batch, generator=generator) < share).sum()) if beside else batch
-        seen = (small if fraction < COARSE_UNTIL else views)[turns[0].take(mine) + turns[1].take(batch - mine)]
-        height, width = seen.size
-        behind = torch.rand(3, generator=generator).to(views.rgb) if background is None else background
-        here = scene()
-        rgb, alpha = render(here, seen.c2w, seen.intrinsics, seen.time, width, height, background=behind)
-        loss(Step(rgb, alpha, seen, behind, here, fraction)).backward()
-        done += 1
-        if edit:
-            edit(done, fraction)
-        parameters.step(fraction)
-    bar.close()
-    return done

@@ -3,67 +3,118 @@
 
 One view a moment says little about a scene, and is soon learnt by heart (33 dB on the inputs where other views
 gain nothing any more). What keeps it from that:
-    few, larger, longer-lived Gaussians, fused from those predicted: several views see each, and steps are quick;
+    few, larger, longer-lived Gaussians, merged from those predicted: several views see each, and steps are quick;
     a prediction from depth and motion is drawn from all around first, and the few are fitted to these pictures as
     well as to the photographs, more and more to the latter;
-    a price on opacity, random backgrounds, and small pictures at first;
+    a weight on opacity, random backgrounds, and small pictures at first;
     of some states on the way, the best on a few input views is taken, and the start where none is better.
 These views are fitted like the others, so that they tell where a fit goes wrong, not where it begins to overfit.
-Held out, they said "stay" of an object that gained 3.5 dB elsewhere, even after fusing: the start is made of them.
+Held out, they said "stay" of an object that gained 3.5 dB elsewhere, even after merging: the start is made of them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ...datagen.rigs import spherical
-from ...datagen.sequence import InputError, opengl_to_opencv
-from ..baselines.four_dgs import EVERY, RATES, UNTIL, activate, densify
+from ...datagen.sequence import InputError
 from ..gaussians import Gaussians4D, Moving
 from ..parallel import clock
-from ..rasterize import render
 from ..views import Views
-from .loop import Parameters, Step, gradients, optimise, own, photographs, ready, shrunk
-from .merge import fuse
+from .densify import Densifier
+from .fit_views import detached, downsampled, reduction, squared_error, validation_views, views_around
+from .loop import Schedule, Step, gradients, optimise, photometric_loss, warm_up
+from .merge import merge_gaussians
+from .parameters import RATES, Parameters, activate, raw_parameters
 
 PIXELS = 128**2  # of a picture, to which seconds and numbers of Gaussians below refer
-SMALL = 64  # longest side in pixels of what a prediction from RGB is made of before it is fused; fits begin with
+SMALL = 64  # longest side in pixels of what a prediction from RGB is made of before it is merged; fits begin with
 # pictures of half the size, but no less: 0.1 dB and a fifth more steps
-JUDGES = 4  # input views that judge
-LOOKS = 6  # states on the way that are judged, the last one included
-FUSED = 2 / 3  # of the Gaussians wanted are fused from those predicted; the others are split off where the fit pulls
+LOOKS = 6  # states on the way that are validated, the last one included
+MERGED = 2 / 3  # of the Gaussians wanted are merged from those predicted; the others are split off where the fit pulls
 
-# A prediction from RGB:
-FEW, PRICE = 3000, 0.04  # Gaussians; price of mean opacity in the loss, times the share of the pictures that is object
-FEWEST = 6  # input views; fewer are learnt by heart: with 4 other views lost 0.6 dB, with 8 they won 1.2
-ENOUGH = 1500  # steps; more learn the photographs by heart: after 4000, other views were worse by up to 0.2 dB
-LIFE = 0.25  # least σ_t at the start, an eighth of the clip: several views of one a frame
-FADE = 0.3  # of opacity at the start: what hides the rest must not be there before it is known to be right
 
-# A prediction from depth and motion:
-NEAR_FEW, NEAR_PRICE, NEAR_ENOUGH = 4000, 0.02, 3000  # after 1500 steps there were 0.0 to 0.3 dB left to win
-ALL = 4.0  # seconds, times PIXELS, up to which its Gaussians are all kept, and moved only a little: some 80 steps
-FIRST, LONGEST = 0.3, 3.0  # of more seconds this share, and so many at most, come before they are fused
-AROUND = 96  # pictures of them from other sides
-STEEPEST = 58  # degrees of elevation, up and down, of where these are taken
-# Learning rates at the start and at the end, of the raw parameters, while all are kept: places are right to a pixel.
-# (Four times the rate of opacity, with a price, won a little more on clouds of 75,000, and lost on larger ones, which
-# take fewer steps.) Of the few: those of four_dgs.
-NEAR = {
-    "xyz": (2e-4, 2e-4),
-    "t": (0.0, 0.0),
-    "velocity": (1e-3, 1e-3),
-    "sigma_t": (1e-2, 5e-3),
-    "scale": (5e-3, 2e-3),
-    "rotation": (0.0, 0.0),
-    "rgb": (2e-3, 1e-3),
-    "opacity": (3e-2, 1e-2),
-}
+@dataclass(frozen=True)
+class Few:
+    """How few Gaussians, merged from those predicted, are fitted."""
+
+    max_gaussians: int  # beyond which refinement does not gain, for pictures of PIXELS
+    grows: bool  # whether there may be more of them for larger pictures, in proportion to their sides
+    opacity_weight: float  # in the loss, of mean opacity, times the share of the pictures that is object
+    max_steps: int
+    min_views: int  # fewer input views are learnt by heart
+    min_sigma_t: float  # at the start
+    fade: float  # of opacity at the start
+
+    @staticmethod
+    def of(has_depth: bool) -> Few:
+        """Those for a prediction from depth and motion, or from RGB."""
+        return FROM_DEPTH if has_depth else FROM_RGB
+
+    def limit(self, views: Views) -> int:
+        """Gaussians beyond which refinement to these views does not gain."""
+        return round(self.max_gaussians * (enlargement(views) ** 0.5 if self.grows else 1.0))
+
+    def merged(self, g: Gaussians4D, max_gaussians: int) -> dict[str, Tensor]:
+        """Raw parameters of the Gaussians, merged from `g` (N,), that a fit of `max_gaussians` starts from."""
+        return raw_parameters(merge_gaussians(g, max(int(MERGED * max_gaussians), 1)), self.min_sigma_t, self.fade)
+
+
+FROM_RGB = Few(
+    max_gaussians=3000,
+    grows=False,
+    opacity_weight=0.04,
+    max_steps=1500,  # more learn the photographs by heart: after 4000, other views were worse by up to 0.2 dB
+    min_views=6,  # with 4 other views lost 0.6 dB, with 8 they won 1.2
+    min_sigma_t=0.25,  # an eighth of the clip: several views of one a frame
+    fade=0.3,  # what hides the rest must not be there before it is known to be right
+)
+FROM_DEPTH = Few(
+    max_gaussians=4000,
+    grows=True,
+    opacity_weight=0.02,
+    max_steps=3000,  # after 1500 there were 0.0 to 0.3 dB left to win
+    min_views=0,
+    min_sigma_t=1e-6,
+    fade=1.0,
+)
+
+
+@dataclass(frozen=True)
+class All:
+    """How all the Gaussians of a prediction from depth and motion are fitted, before they are merged: moved only a
+    little."""
+
+    rates: dict[str, tuple[float, float]]  # learning rates at the start and at the end
+    enough: float  # seconds, for pictures of PIXELS, up to which they are never merged: some 80 steps
+    share: float  # of more seconds that come before they are merged …
+    longest: float  # … and so many seconds at most
+
+    def part(self, seconds: float, enlarged: float) -> float:
+        """The share 0..1 of `seconds` (0: a number of steps is given) for pictures `enlarged` times PIXELS."""
+        return min(self.share, self.longest * enlarged / seconds if seconds else 1.0)
+
+
+# Places are right to a pixel. (Four times the rate of opacity, with a weight on it, won a little more on clouds of
+# 75,000, and lost on larger ones, which take fewer steps.)
+ALL = All(
+    rates={
+        "xyz": (2e-4, 2e-4),
+        "t": (0.0, 0.0),
+        "velocity": (1e-3, 1e-3),
+        "sigma_t": (1e-2, 5e-3),
+        "scale": (5e-3, 2e-3),
+        "rotation": (0.0, 0.0),
+        "rgb": (2e-3, 1e-3),
+        "opacity": (3e-2, 1e-2),
+    },
+    enough=4.0,
+    share=0.3,
+    longest=3.0,
+)
 
 
 def check_seconds(seconds: float) -> None:
@@ -72,88 +123,16 @@ def check_seconds(seconds: float) -> None:
         raise InputError(f"{seconds:g} seconds of refinement: give 0 or more.")
 
 
-def refine(
-    start: Gaussians4D | Moving,
-    views: Views,
-    seconds: float,
-    device: str = "cpu",
-    *,
-    near: bool = False,
-    count: int | None = None,
-    steps: int | None = None,
-    seed: int = 0,
-    progress=None,
-) -> Gaussians4D:
-    """Gaussians and the input views that they are of -> refined Gaussians on the CPU, after `seconds` or exactly
-    `steps`; `start` itself for zero seconds, for fewer than FEWEST views of RGB, or where the views that judge fit
-    no better. `near`: the start knows depth and motion. count: how many Gaussians are wanted, 1 or more; the result
-    has no more, even if it is worse. For `progress` see `optimise`.
-
-    Raises InputError for a scene that is not of 4D Gaussians and for a wrong number of seconds."""
-    check_seconds(seconds)
-    if not isinstance(start, Gaussians4D):
-        raise InputError("Refinement is of 4D Gaussians, and this method's scene is of another kind; leave it out.")
-    if (seconds == 0 and not steps) or not len(start) or (len(views) < FEWEST and not near and count is None):
-        return start
-    ready(device)
-    began = clock()
-    with gradients():
-        g = start.map(lambda x: x.detach().to(device).clone())
-        g = g[g.alive()].with_axes()
-        if not len(g):
-            return start
-        views = own(views, device)
-        least, better, first = error(g, views[judging(views)]), None, 0.0
-        larger = views.alpha[0].numel() / PIXELS
-        fusing = not near or count is not None or seconds > ALL * larger
-        if near:
-            longest = LONGEST * larger / seconds if seconds else 1.0
-            first = min(FIRST, longest) if fusing else 1.0  # share of the budget
-            whole = None if steps is None else round(first * steps)
-            e, moved = fit(
-                raw(g), NEAR, views, first * seconds, steps=whole, seed=seed, progress=part(progress, 0, first)
-            )
-            if e < least:
-                g = better = moved
-        if fusing:
-            most = count or limit(views, near)
-            beside = around(g, views, seed) if near else None
-            values, price = few(g, most, near)
-            e, fitted = fit(
-                values,
-                RATES,
-                views,
-                max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
-                beside=beside,
-                most=most,
-                price=price,
-                enough=NEAR_ENOUGH if near else ENOUGH,
-                coarse=max(-(-max(views.size) // 2), SMALL),
-                steps=None if steps is None else steps - round(first * steps),
-                seed=seed,
-                progress=part(progress, first, 1),
-            )
-            if e < least or count is not None:
-                better = fitted
-        return start if better is None else better.to("cpu")
-
-
-def few(g: Gaussians4D, count: int, near: bool) -> tuple[dict[str, Tensor], float]:
-    """Raw parameters of the Gaussians that a fit of `count` starts from, fused from `g`; and their price."""
-    fused = fuse(g, max(int(FUSED * count), 1))
-    return (raw(fused), NEAR_PRICE) if near else (raw(fused, LIFE, FADE), PRICE)
-
-
-def limit(views: Views, near: bool) -> int:
-    """Gaussians beyond which refinement does not gain; with depth and motion in proportion to the pictures' sides."""
-    return round(NEAR_FEW * (views.alpha[0].numel() / PIXELS) ** 0.5) if near else FEW
+def enlargement(views: Views) -> float:
+    """How many times PIXELS a picture has."""
+    return views.alpha[0].numel() / PIXELS
 
 
 def start_size(views: Views) -> Views:
     """The views, without depth and flow, at a size of at most SMALL pixels if refinement would fit them at all: after
     4 seconds, what a prediction from RGB was made of at 64² or 128² was the same to 0.1 dB, on four objects."""
     small = replace(views, depth=None, flow=None)
-    return shrunk(small, -(-max(views.size) // SMALL)) if len(views) >= FEWEST else small
+    return downsampled(small, reduction(views, SMALL)) if len(views) >= FROM_RGB.min_views else small
 
 
 def part(progress, first: float, last: float):
@@ -161,112 +140,154 @@ def part(progress, first: float, last: float):
     return progress and (lambda fraction, text: progress(first + (last - first) * fraction, text))
 
 
+def refine(
+    start: Gaussians4D | Moving,
+    views: Views,
+    seconds: float,
+    device: str = "cpu",
+    *,
+    has_depth: bool = False,
+    max_gaussians: int | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    progress=None,
+) -> Gaussians4D:
+    """Gaussians (N,) and the input views that they are of -> refined Gaussians on the CPU, after `seconds` or exactly
+    `steps`; `start` itself for zero seconds, for too few views of RGB, or where the validation views fit no better.
+    has_depth: the start is made from depth and motion. max_gaussians: how many are wanted, 1 or more; the result
+    has no more, even if it is worse. For `progress` see `optimise`.
+
+    Raises InputError for a scene that is not of 4D Gaussians and for a wrong number of seconds."""
+    check_seconds(seconds)
+    if not isinstance(start, Gaussians4D):
+        raise InputError("Refinement is of 4D Gaussians, and this method's scene is of another kind; leave it out.")
+    few = Few.of(has_depth)
+    too_few = len(views) < few.min_views and max_gaussians is None
+    if (seconds == 0 and not steps) or not len(start) or too_few:
+        return start
+    warm_up(device)
+    began = clock()
+    with gradients():
+        g = start.map(lambda x: x.detach().to(device).clone())
+        g = g[g.alive()].with_axes()
+        if not len(g):
+            return start
+        views = detached(views, device)
+        start_error, better = squared_error(g, views[validation_views(views)]), None
+        enlarged = enlargement(views)
+        merging = not has_depth or max_gaussians is not None or seconds > ALL.enough * enlarged
+        first = 0.0  # share of the budget that comes before merging
+        if has_depth:
+            first = ALL.part(seconds, enlarged) if merging else 1.0
+            schedule = Schedule(
+                seconds=first * seconds,
+                steps=None if steps is None else round(first * steps),
+                coarse_size=None,
+                seed=seed,
+            )
+            error, moved = fit(raw_parameters(g), ALL.rates, views, schedule, progress=part(progress, 0, first))
+            if error < start_error:
+                g = better = moved
+        if merging:
+            extra_views = views_around(g, views, seed) if has_depth else None
+            schedule = Schedule(
+                seconds=max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
+                steps=None if steps is None else steps - round(first * steps),
+                max_steps=few.max_steps,
+                coarse_size=max(-(-max(views.size) // 2), SMALL),
+                seed=seed,
+            )
+            told = part(progress, first, 1)
+            wanted = max_gaussians or few.limit(views)
+            error, fitted = fit_few(g, wanted, few, views, schedule, extra_views=extra_views, progress=told)
+            if error < start_error or max_gaussians is not None:
+                better = fitted
+        return start if better is None else better.to("cpu")
+
+
+def fit_few(
+    g: Gaussians4D,
+    max_gaussians: int,
+    few: Few,
+    views: Views,
+    schedule: Schedule,
+    *,
+    extra_views: Views | None = None,
+    progress=None,
+) -> tuple[float, Gaussians4D]:
+    """No more than `max_gaussians`, merged from `g` (N,), fitted to the views (and to extra ones) as `few` says ->
+    the error and the Gaussians of `fit`."""
+    return fit(
+        few.merged(g, max_gaussians),
+        RATES,
+        views,
+        schedule,
+        extra_views=extra_views,
+        max_gaussians=max_gaussians,
+        opacity_weight=few.opacity_weight,
+        progress=progress,
+    )
+
+
+class Validation:
+    """The best of a fit's states by its error on the validation views."""
+
+    def __init__(self, views: Views):
+        self.views = views[validation_views(views)]
+        self.error, self.best, self.looks = math.inf, None, 0
+
+    @torch.no_grad()
+    def look(self, values: dict[str, Tensor]) -> None:
+        """Keeps the Gaussians of these raw parameters if they are the best so far."""
+        now = activate(values)
+        error = squared_error(now, self.views)
+        if error < self.error or self.best is None:
+            self.error, self.best = error, now.map(torch.clone)
+
+    def look_now_and_then(self, values: dict[str, Tensor], fraction: float) -> None:
+        """Every LOOKS-th of the budget, of which `fraction` 0..1 is spent."""
+        if fraction * LOOKS >= self.looks + 1:
+            self.looks += 1
+            self.look(values)
+
+
 def fit(
     values: dict[str, Tensor],
     rates: dict[str, tuple[float, float]],
     views: Views,
-    seconds: float,
+    schedule: Schedule,
     *,
-    beside: Views | None = None,
-    most: int | None = None,
-    price: float = 0.0,
-    coarse: int | None = None,
-    enough: int | None = None,
-    steps: int | None = None,
-    seed: int = 0,
+    extra_views: Views | None = None,
+    max_gaussians: int | None = None,
+    opacity_weight: float = 0.0,
     progress=None,
 ) -> tuple[float, Gaussians4D]:
-    """Raw parameters fitted to views (and those `beside`) by `optimise` -> the best state's error on the views that
-    judge, and that state. most: Gaussians are split up to this number; None: they stay as many as they are."""
-    judges, cover = views[judging(views)], views.alpha.mean()
-    p, generator = Parameters(values, rates), torch.Generator().manual_seed(seed)
-    best, kept, looked, pull = math.inf, None, 0, torch.zeros_like(p["t"].detach())
+    """Raw parameters fitted to views (and to extra ones) by `optimise` -> the best state's mean squared error on the
+    validation views, and that state. max_gaussians: they are split up to this number; None: they stay as many as
+    they are. opacity_weight: of mean opacity in the loss, times the share of the pictures that is object."""
+    p, cover, validation = Parameters(values, rates), views.alpha.mean(), Validation(views)
+    generator = torch.Generator().manual_seed(schedule.seed)
+    densifier = Densifier(p, generator, max_gaussians) if max_gaussians else None
 
     def loss(step: Step) -> Tensor:
-        return photographs(step) + (price * cover * step.scene.opacity.mean() if price else 0.0)
+        weight = opacity_weight * cover
+        return photometric_loss(step) + (weight * step.scene.opacity.mean() if opacity_weight else 0.0)
 
-    def look() -> None:
-        nonlocal best, kept
-        with torch.no_grad():
-            now = activate(p.values)
-            e = error(now, judges)
-            if e < best or kept is None:
-                best, kept = e, now.map(torch.clone)
-
-    def edit(number: int, fraction: float) -> None:
-        nonlocal looked, pull
-        if most:
-            pull += p["xyz"].grad.norm(dim=-1)
-            if number % EVERY == 0 and fraction < UNTIL:
-                densify(p, pull, generator, most)
-                pull = torch.zeros_like(p["t"].detach())
-        if fraction * LOOKS >= looked + 1:
-            looked += 1
-            look()
+    def after_backward(number: int, fraction: float) -> None:
+        if densifier:
+            densifier.after_backward(number, fraction)
+        validation.look_now_and_then(p.values, fraction)
 
     optimise(
         p,
         lambda: activate(p.values),
         views,
         loss,
-        seconds,
-        beside=beside,
-        steps=steps,
-        enough=enough,
-        coarse=coarse or max(views.size),
-        edit=edit,
-        seed=seed,
+        schedule,
+        extra_views=extra_views,
+        after_backward=after_backward,
         text="refining",
         progress=progress,
     )
-    look()
-    return best, kept
-
-
-def judging(views: Views, count: int = JUDGES) -> Tensor:
-    """(at most `count`,) indices of the views that judge, spread over the clip."""
-    order, n = views.time.argsort(stable=True), min(count, len(views))
-    return order[[len(views) * (2 * i + 1) // (2 * n) for i in range(n)]]
-
-
-@torch.no_grad()
-def error(g: Gaussians4D, views: Views) -> float:
-    """Mean squared error of the pictures over white, with the paper's inference filters."""
-    height, width = views.size
-    rgb, _ = render(g, views.c2w, views.intrinsics, views.time, width, height, inference=True)
-    return float((rgb - views.over(1.0)).square().mean())
-
-
-def raw(g: Gaussians4D, life: float = 1e-6, fade: float = 1.0) -> dict[str, Tensor]:
-    """Gaussians -> raw parameters as `activate` takes them, σ_t at least `life`, opacity times `fade`."""
-    return {
-        "xyz": g.xyz,
-        "t": g.t,
-        "velocity": g.velocity,
-        "sigma_t": g.sigma_t.clamp_min(life).log(),
-        "scale": g.scale.clamp_min(1e-6).log(),
-        "rotation": g.rotation,
-        "rgb": g.rgb,
-        "opacity": (fade * g.opacity).clamp(0.01, 0.99).logit(),
-    }
-
-
-@torch.no_grad()
-def around(g: Gaussians4D, views: Views, seed: int = 0, count: int = AROUND) -> Views:
-    """`count` pictures of the Gaussians from random sides at frames between the first and the last view, whether or not
-    a view shows them, taken as the views are: from their median distance to the origin, with the median of their
-    intrinsics."""
-    rng = np.random.default_rng([seed, 11])
-    distance = float(views.c2w[:, :3, 3].norm(dim=-1).median())
-    steepest = math.sin(math.radians(STEEPEST))
-    elevations = np.degrees(np.arcsin(rng.uniform(-steepest, steepest, count)))
-    poses = [spherical(a, e, distance) for a, e in zip(rng.uniform(0, 360, count), elevations, strict=True)]
-    c2w = torch.from_numpy(opengl_to_opencv(np.stack(poses))).to(views.c2w)
-    intrinsics = views.intrinsics.median(0).values.expand(count, 4).clone()
-    first, last = float(views.time.min()), float(views.time.max())
-    frames = round((last - first) / views.frame_step) + 1
-    time = first + views.frame_step * torch.from_numpy(rng.integers(frames, size=count)).to(views.time)
-    height, width = views.size
-    rgb, alpha = render(g, c2w, intrinsics, time, width, height, background=0.0, inference=True)
-    rgb = rgb / alpha.clamp_min(1e-4)[..., None]  # straight
-    return replace(views, rgb=rgb, alpha=alpha, c2w=c2w, intrinsics=intrinsics, time=time)
+    validation.look(p.values)
+    return validation.error, validation.best

@@ -21,7 +21,6 @@ from ..gaussians import Gaussians4D, rotation_matrix
 from ..rasterize import render
 from ..views import Views
 
-SURFACES = {"lift", "guided", "rgb", "sweep"}  # methods whose Gaussians know which way their surface faces
 GRID = 40  # voxels along [-1,1] that are seen to be empty, or not
 NEAR = 4.5  # a view speaks of the space at moments that are at most so many frames away …
 FEWEST = 8  # … and as many views as this are heard in any case
@@ -32,7 +31,7 @@ FAINT = 0.1  # Gaussians that are fainter at a moment are not drawn
 def coverage(
     g: Gaussians4D, views: Views, moments: int = 3, directions: int = 12, size: int = 64
 ) -> tuple[float, Tensor]:
-    """g from `lift`, `guided` or `sweep`, from these views (depth is used where they have it) -> the covered share of
+    """g from a method that `knows_surface`, from these views (depth is used where they have it) -> the covered share of
     what cameras in `directions` directions see of the object, 0..1, and the same at each of `moments` times, evenly
     over the clip. 0 where nothing is seen at all."""
     g, views = g.to("cpu"), views.to("cpu")

@@ -16,9 +16,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...datagen.sequence import InputError
+from ..checkpoints_io import load_network, save_network
+from ..devices import check_device
 from ..gaussians import Gaussians4D
+from ..inference import geometry_for
 from ..network import PRESETS, Config, Network, load_matching
-from ..reconstruct import check_device, geometry_for, load_network, save_network
 from ..views import BACKGROUND, Views
 from . import distributed
 from .config import TrainConfig

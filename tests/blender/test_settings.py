@@ -72,11 +72,11 @@ def test_what_the_settings_select(blender):
     assert told["said"] == [
         "Front, left, back, right in turn", "5 selected cameras", "5 cameras of the rig", "1 selected camera",
     ]  # fmt: skip
-    from timesplat.model.fitting.refine import NEAR_FEW
+    from timesplat.model.fitting.refine import FROM_DEPTH
 
     counts = told["counts"]  # five pictures
     assert counts["ALL 0 128"][0] == round(0.19 * 5 * 128**2) and counts["SHARE 0 128"][0] == round(0.019 * 5 * 128**2)
     assert counts["SHARE 0 32"][0] == round(0.019 * 5 * 32**2) and counts["NUMBER 0 128"][0] == 100
     assert counts["learnt"] == round(0.9 * 5 * 128**2)
-    assert counts["ALL 9 256"][0] == 2 * NEAR_FEW
+    assert counts["ALL 9 256"][0] == 2 * FROM_DEPTH.max_gaussians
     assert counts["SHARE 0 128"][1] - counts["ALL 0 128"][1] == pytest.approx(5)

@@ -7,8 +7,8 @@ import pytest
 
 from timesplat.datagen.sequence import InputError
 from timesplat.evaluation import ablations
+from timesplat.model.checkpoints_io import save_network
 from timesplat.model.network import Config, Network
-from timesplat.model.reconstruct import save_network
 
 
 def table_of(path):

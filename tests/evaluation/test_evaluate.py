@@ -9,7 +9,7 @@ from pathlib import Path
 from timesplat.cli import main
 from timesplat.evaluation.provenance import ROOT, revision
 from timesplat.evaluation.tables import COLUMNS
-from timesplat.model.reconstruct import CHECKPOINTS
+from timesplat.model.checkpoints_io import CHECKPOINTS
 
 
 def test_metrics_json_has_the_promised_names(alternating_folders, tmp_path, capsys):

@@ -18,8 +18,8 @@ def test_smaller_sizes_are_averages(sphere_folder):
     blocks = truth.picture.reshape(6, 16, 2, 16, 2, 3).mean((2, 4))
     assert torch.allclose(half.picture, blocks, atol=1e-6)
     assert torch.allclose(half.views.intrinsics * 2, truth.views.intrinsics)
-    with_depth, without = (load_inputs(seq, range(24), depth, 16) for depth in (True, False))
-    assert torch.equal(with_depth.rgb, without.rgb) and without.depth is None and with_depth.depth is not None
+    has_depth, without = (load_inputs(seq, range(24), depth, 16) for depth in (True, False))
+    assert torch.equal(has_depth.rgb, without.rgb) and without.depth is None and has_depth.depth is not None
     assert torch.allclose(without.over(1.0), load_truth(seq, range(24), [], 16).picture, atol=1e-5)
     with pytest.raises(InputError, match="do not shrink to 20"):
         load_inputs(seq, range(24), False, 20)

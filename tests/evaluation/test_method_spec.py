@@ -6,9 +6,9 @@ import torch
 
 from timesplat.datagen.sequence import InputError
 from timesplat.evaluation.method_spec import parse_spec, parse_specs
+from timesplat.model.checkpoints_io import save_network
 from timesplat.model.fitting.budget import SECONDS
 from timesplat.model.network import Config, Network
-from timesplat.model.reconstruct import save_network
 
 
 def test_every_part():

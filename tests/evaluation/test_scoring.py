@@ -77,7 +77,7 @@ def test_other_moving_scenes_are_scored_as_well(evaluated, monkeypatch):
 def test_the_device_reaches_the_method(evaluated, seq, monkeypatch):
     got = []
     plain = scoring.reconstruct_views
-    monkeypatch.setattr(scoring, "reconstruct_views", lambda v, m, d, *a, **k: got.append(d) or plain(v, m, "cpu"))
+    monkeypatch.setattr(scoring, "reconstruct_views", lambda v, m, options: got.append(options.device) or plain(v, m))
     targets = protocol.held_out(seq)
     views, truth = load_inputs(seq, range(4), True), load_truth(seq, targets, targets)
     evaluate_views(views, parse_spec("lift"), truth, device="cuda:1")

@@ -11,8 +11,8 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model.gaussians import FIELDS
 from timesplat.model.geometry.lift import lift_geometry
 from timesplat.model.geometry.plane_sweep import sweep_geometry
+from timesplat.model.inference import geometry_for
 from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patch_rays
-from timesplat.model.reconstruct import geometry_for
 from timesplat.model.views import rays
 
 TINY = {"width": 32, "depth": 2, "heads": 2}

@@ -12,7 +12,7 @@ import pytest
 from timesplat.datagen.rigs import Shot, spherical
 from timesplat.datagen.sequence import opengl_to_opencv
 from timesplat.model import selftest
-from timesplat.model.reconstruct import CHECKPOINTS
+from timesplat.model.checkpoints_io import CHECKPOINTS
 
 NAMES = ["Python", "packages", "device", "memory", "files", "lift", "checkpoints", "network", "refinement", "USD"]
 

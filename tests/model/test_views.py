@@ -36,7 +36,7 @@ def test_pluecker_is_direction_and_the_point_nearest_to_the_origin(spheres):
 
 def test_loading_keeps_colours_cameras_and_times(spheres, sphere_folder):
     seq = read_sequence(sphere_folder)
-    loaded, made = load_views(seq, range(24), passes=True), spheres(list(range(24)), size=32)
+    loaded, made = load_views(seq, range(24), has_depth=True), spheres(list(range(24)), size=32)
     assert (loaded.rgb - made.rgb).abs().max() <= 0.5 / 255 + 1e-6
     for k in ("alpha", "depth", "time", "c2w", "intrinsics"):
         torch.testing.assert_close(getattr(loaded, k), getattr(made, k), atol=1e-5, rtol=1e-5)

@@ -104,7 +104,7 @@ tell(ended=[job.state, job.message], log=job.log_text()[-300:], state=state(), f
 
 
 def test_a_checkpoint_cut_short_and_one_that_is_none(installed, tmp_path):
-    from timesplat.model.reconstruct import CHECKPOINTS
+    from timesplat.model.checkpoints_io import CHECKPOINTS
 
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes((CHECKPOINTS / "guided.safetensors").read_bytes()[:10_000])

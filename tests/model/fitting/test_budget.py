@@ -9,11 +9,12 @@ import torch
 from timesplat.cli import main
 from timesplat.datagen.sequence import InputError
 from timesplat.model.fitting import budget
-from timesplat.model.fitting.budget import fewest, parse, reduced
+from timesplat.model.fitting.budget import apply_budget, find_fewest, parse_budget
+from timesplat.model.fitting.fit_views import squared_error
 from timesplat.model.fitting.merge import contribution
-from timesplat.model.fitting.refine import error
 from timesplat.model.geometry.lift import lift
 from timesplat.model.io.asset import read_ply
+from timesplat.model.methods import ReconstructOptions
 from timesplat.model.reconstruct import reconstruct_views
 
 
@@ -25,20 +26,25 @@ def scene(spheres):
 
 
 def test_what_a_budget_says():
-    assert parse("auto") is None and parse("700") == 700 and parse("10%") == 0.1 and parse("2.5%") == 0.025
+    assert (
+        parse_budget("auto") is None
+        and parse_budget("700") == 700
+        and parse_budget("10%") == 0.1
+        and parse_budget("2.5%") == 0.025
+    )
     for wrong in ("", "0", "-3", "1.5", "0%", "101%", "few", "10 %"):
         with pytest.raises(InputError, match="a number of Gaussians"):
-            parse(wrong)
+            parse_budget(wrong)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_a_share_is_kept_to(scene, near, monkeypatch, steady_clock):
+@pytest.mark.parametrize("has_depth", [False, True])
+def test_a_share_is_kept_to(scene, has_depth, monkeypatch, steady_clock):
     inputs, others = scene
     start = lift(inputs)
     monkeypatch.setattr(budget, "SECONDS", 1.0)
-    g = reduced(start, inputs, "5%", near=near)
+    g = apply_budget(start, inputs, "5%", has_depth=has_depth)
     assert 0 < len(g) <= 0.05 * len(start)
-    assert error(g, others) < 0.5 * error(g[:0], others)
+    assert squared_error(g, others) < 0.5 * squared_error(g[:0], others)
 
 
 def test_a_fit_that_ends_early_keeps_to_the_number_too(scene, monkeypatch):
@@ -46,37 +52,37 @@ def test_a_fit_that_ends_early_keeps_to_the_number_too(scene, monkeypatch):
     inputs, _ = scene
     start = lift(inputs)[::7]
     monkeypatch.setattr(budget, "refine", lambda g, *args, **options: g)
-    g = reduced(start, inputs, "50", near=True)
-    shown = contribution(start, budget.around(start, budget.own(inputs)))
+    g = apply_budget(start, inputs, "50", has_depth=True)
+    shown = contribution(start, budget.views_around(start, budget.detached(inputs)))
     assert len(g) == 50 and torch.equal(g.xyz, start.xyz[shown.topk(50).indices])
 
 
 def test_the_search_ends_where_twice_as_many_are_no_better(scene, monkeypatch):
     inputs, _ = scene
     start = lift(inputs)
-    monkeypatch.setattr(budget, "FEWEST", 50)
-    monkeypatch.setattr(budget, "fit", lambda *_, most, **__: (0.0, most))
+    monkeypatch.setattr(budget, "FIRST_TRY", 50)
+    monkeypatch.setattr(budget, "fit_few", lambda g, number, *_, **__: (0.0, number))
     found, scenes = [], {"needs": 0.0}
-    monkeypatch.setattr(budget, "error", lambda most, views: 1e-3 + scenes["needs"] / most**2)
+    monkeypatch.setattr(budget, "squared_error", lambda number, views: 1e-3 + scenes["needs"] / number**2)
     for scenes["needs"] in (1e-9, 1, 100):
-        n, tried = fewest(start, inputs, 0.1, near=False)
+        n, tried = find_fewest(start, inputs, 0.1, has_depth=False)
         found.append(n)
         assert [k for k, _ in tried] == [50 * 2**i for i in range(len(tried))]
         gain = [b[1] - a[1] for a, b in pairwise(tried)]
         assert gain[-1] <= 0.1 and all(x > 0.1 for x in gain[:-1]) and n == tried[-2][0]
     assert found[0] == 50 and found[0] < found[1] < found[2]
     scenes["needs"] = 1e9
-    assert fewest(start, inputs, 0.1, near=False)[0] > len(start) / 2
-    assert fewest(start[:40], inputs, 0.1, near=False) == (int(start[:40].alive().sum()), [])
+    assert find_fewest(start, inputs, 0.1, has_depth=False)[0] > len(start) / 2
+    assert find_fewest(start[:40], inputs, 0.1, has_depth=False) == (int(start[:40].alive().sum()), [])
     with pytest.raises(InputError, match="give more than 0"):
-        fewest(start, inputs, 0.0, near=False)
+        find_fewest(start, inputs, 0.0, has_depth=False)
 
 
 def test_the_search_as_it_is_used(scene, monkeypatch, steady_clock):
     inputs, _ = scene
-    monkeypatch.setattr(budget, "TRIAL", 0.2)
+    monkeypatch.setattr(budget, "TRY_SECONDS", 0.2)
     told = []
-    n, tried = fewest(lift(inputs), inputs, 1.0, near=True, progress=lambda f, text: told.append(f))
+    n, tried = find_fewest(lift(inputs), inputs, 1.0, has_depth=True, progress=lambda f, text: told.append(f))
     assert n in (tried[-2][0], tried[-1][0]) and told == sorted(told) and all(10 < db < 60 for _, db in tried)
 
 
@@ -85,9 +91,9 @@ def test_as_part_of_a_reconstruction_and_from_the_command_line(
 ):
     inputs, others = scene
     monkeypatch.setattr(budget, "SECONDS", 0.3)
-    monkeypatch.setattr(budget, "TRIAL", 0.1)
+    monkeypatch.setattr(budget, "TRY_SECONDS", 0.1)
     with torch.inference_mode():
-        assert len(reconstruct_views(inputs, "lift", budget="300")) <= 300
+        assert len(reconstruct_views(inputs, "lift", ReconstructOptions(budget="300"))) <= 300
     folder = tmp_path / "spheres"
     write_views(inputs, folder, others)
     args = ["reconstruct", str(folder), "--method", "hull", "--out", str(tmp_path / "a.ply")]
@@ -98,4 +104,4 @@ def test_as_part_of_a_reconstruction_and_from_the_command_line(
     assert main([*args, "--budget", "auto", "--max-loss", "3"]) == 0
     assert main([*args, "--budget", "auto", "--max-loss", "0"]) == 2
     with pytest.raises(InputError, match="of another kind"):
-        reduced(object(), inputs, "10%", near=False)
+        apply_budget(object(), inputs, "10%", has_depth=False)

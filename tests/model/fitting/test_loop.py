@@ -1,50 +1,20 @@
-"""The optimisation loop: Adam as torch has it, rows that come and go, pictures averaged down, budgets."""
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The optimisation loop: small pictures first, budgets in seconds and in steps."""
 
 import pytest
 import torch
 
 from timesplat.model.fitting import loop as module
-from timesplat.model.fitting.loop import BETAS, EPSILON, Parameters, gradients, optimise, own, photographs, shrunk
+from timesplat.model.fitting.fit_views import detached
+from timesplat.model.fitting.loop import Schedule, gradients, optimise, photometric_loss
+from timesplat.model.fitting.parameters import Parameters
 from timesplat.model.gaussians import Gaussians4D
 
 
-def test_adam_is_torchs_and_rates_decay():
-    torch.manual_seed(0)
-    start, pull = torch.randn(5, 3), torch.randn(5, 3)
-    p = Parameters({"a": start, "fixed": start}, {"a": (0.1, 0.001), "fixed": (0.0, 0.0)})
-    theirs = torch.nn.Parameter(start.clone())
-    adam = torch.optim.Adam([theirs], betas=BETAS, eps=EPSILON)
-    for i in range(10):
-        adam.param_groups[0]["lr"] = 0.1 * 0.01 ** (i / 10)
-        for x in (theirs, p["a"]):
-            ((x - pull) ** 2).sum().backward()
-        adam.step()
-        adam.zero_grad()
-        p.step(i / 10)
-    torch.testing.assert_close(p["a"], theirs, atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(p["fixed"].detach(), start, rtol=0, atol=0)
-
-
-def test_rows_take_their_moments_along_and_nan_moves_nothing():
-    p = Parameters({"a": torch.zeros(4), "b": torch.zeros(4, 2)}, {"a": (1.0, 1.0), "b": (1.0, 1.0)})
-    (p["a"] * torch.arange(4.0)).sum().backward()
-    p.rows(torch.tensor([3, 3, 1]))
-    assert p["a"].grad.tolist() == [3, 3, 1] and p["b"].shape == (3, 2) and p["b"].grad is None
-    p["a"].grad[2] = torch.nan
-    p.step(0.0)
-    assert p["a"].tolist() == [-1, -1, 0] and p["a"].requires_grad
-    p.forget(torch.tensor([0]))
-    assert p.moments["a"][0][0] == 0 and p.moments["a"][0][1] != 0
-
-
-def test_shrunk_pictures_are_the_same_seen_smaller(spheres):
-    large, small = spheres([5], [(30, 20)], size=96), spheres([5], [(30, 20)], size=32)
-    got = shrunk(large, 3)
-    assert got.size == (32, 32) and shrunk(large, 1) is large
-    torch.testing.assert_close(got.intrinsics, small.intrinsics)
-    torch.testing.assert_close(got.over(1.0).mean((0, 1, 2)), large.over(1.0).mean((0, 1, 2)))
-    assert (got.over(1.0) - small.over(1.0)).abs().mean() < 0.02
-    assert shrunk(spheres([5], size=50), 4).size == (13, 13)
+def test_a_schedule_says_what_share_is_spent():
+    assert Schedule(seconds=4).fraction(1.0, 99) == 0.25 and Schedule(seconds=4).fraction(9.0, 0) == 1
+    assert Schedule(seconds=4, steps=10).fraction(99.0, 5) == 0.5 and Schedule().fraction(0.0, 0) == 1
+    assert Schedule(seconds=4, max_steps=10).fraction(1.0, 5) == 0.5
 
 
 @pytest.mark.parametrize("size", [24, 200])
@@ -54,7 +24,7 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
         views.alpha = torch.ones_like(views.alpha)
         views.rgb = torch.tensor([0.2, 0.5, 0.7]).expand_as(views.rgb)
         with gradients():
-            mine = own(views)
+            mine = detached(views)
             p = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)})
             one = torch.ones(1)
 
@@ -65,22 +35,24 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
                 )
 
             drawn = []
-            done = optimise(p, scene, mine, lambda s: drawn.append(s.rgb.shape) or photographs(s), 0, steps=40)
-    assert done == 40 and optimise(p, scene, mine, photographs, 0.0) == 0
+            done = optimise(
+                p, scene, mine, lambda s: drawn.append(s.rgb.shape) or photometric_loss(s), Schedule(steps=40)
+            )
+    assert done == 40 and optimise(p, scene, mine, photometric_loss, Schedule()) == 0
     torch.testing.assert_close(p["rgb"].detach()[0], torch.tensor([0.2, 0.5, 0.7]), atol=0.05, rtol=0)
     assert drawn[0] == (2, min(size, 100), min(size, 100), 3) and drawn[-1] == (2, size, size, 3)
     with gradients():
-        assert optimise(p, scene, mine, photographs, 1e9, enough=3) == 3
+        assert optimise(p, scene, mine, photometric_loss, Schedule(seconds=1e9, max_steps=3)) == 3
 
 
 def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatch):
     """Each step takes a second of this clock, what makes the kernels ready a minute."""
     now, told = [0.0], []
     monkeypatch.setattr(module, "clock", lambda: now[0])
-    monkeypatch.setattr(module, "ready", lambda device: now.append(now.pop() + 60))
+    monkeypatch.setattr(module, "warm_up", lambda device: now.append(now.pop() + 60))
     one = torch.ones(1)
     with gradients():
-        views = own(spheres([0, 12], size=16))
+        views = detached(spheres([0, 12], size=16))
         p = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)})
 
         def scene():
@@ -89,9 +61,10 @@ def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatc
 
         def loss(step):
             now[0] += 1
-            return photographs(step)
+            return photometric_loss(step)
 
-        assert optimise(p, scene, views, loss, 8, progress=lambda fraction, text: told.append(fraction)) == 8
+        schedule = Schedule(seconds=8)
+        assert optimise(p, scene, views, loss, schedule, progress=lambda fraction, text: told.append(fraction)) == 8
     assert told == [i / 8 for i in range(1, 9)]
 
 
@@ -100,5 +73,5 @@ def test_what_compiles_the_kernels_draws_and_steps(monkeypatch):
     draw = module.render
     monkeypatch.setattr(module, "render", lambda *a, **k: drawn.append(draw(*a, **k)) or drawn[-1])
     with torch.inference_mode():
-        module.ready.__wrapped__("cpu")
+        module.warm_up.__wrapped__("cpu")
     assert len(drawn) == 2 and all(alpha.max() > 0.3 for _, alpha in drawn) and drawn[0][0].requires_grad

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fusion: moments are kept, what stands still is fused over the clip; contributions are the blending weights."""
+"""Merging: moments are kept, what stands still is merged over the clip; contributions are the blending weights."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from timesplat.model.fitting.merge import MOMENTS, contribution, fuse
-from timesplat.model.fitting.refine import error
+from timesplat.model.fitting.fit_views import squared_error
+from timesplat.model.fitting.merge import MOMENTS, contribution, merge_gaussians
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
 from timesplat.model.rasterize import render
@@ -20,11 +20,11 @@ def views(spheres):
 
 def test_moments_are_kept(views):
     g = lift(views)
-    few = fuse(g, 500)
-    assert 350 < len(few) < 650 and fuse(g, len(g)) is g
-    assert error(few, views) < 0.02
+    few = merge_gaussians(g, 500)
+    assert 350 < len(few) < 650 and merge_gaussians(g, len(g)) is g
+    assert squared_error(few, views) < 0.02
     pair = g[[0, 0]]
-    same = fuse(pair, 1)
+    same = merge_gaussians(pair, 1)
     torch.testing.assert_close(same.covariance3(), pair.covariance3()[:1], atol=1e-7, rtol=1e-3)
     for k in ("xyz", "t", "velocity", "sigma_t", "rgb"):
         torch.testing.assert_close(getattr(same, k), getattr(pair, k)[:1], atol=1e-5, rtol=1e-4)
@@ -48,19 +48,19 @@ def row(n: int, **changes) -> Gaussians4D:
 
 def test_what_stands_still_is_one_for_the_whole_clip_and_what_moves_is_not():
     g = row(24)
-    one = fuse(g, 1)
+    one = merge_gaussians(g, 1)
     assert len(one) == 1
     # the moments over time, by hand
     t = g.t - g.t.mean()
     torch.testing.assert_close(one.sigma_t, (0.05**2 + t.square().mean()).sqrt()[None])
     torch.testing.assert_close(one.rgb, g.rgb.mean(0, keepdim=True))
-    moving = fuse(row(24, velocity=torch.tensor([2.0, 0, 0]).expand(24, 3)), 1)
+    moving = merge_gaussians(row(24, velocity=torch.tensor([2.0, 0, 0]).expand(24, 3)), 1)
     assert len(moving) == MOMENTS
 
 
 def test_who_is_seen_more_decides_the_means():
     g = row(2, t=torch.zeros(2), opacity=torch.tensor([0.6, 0.2]))
-    few = fuse(g, 1)
+    few = merge_gaussians(g, 1)
     torch.testing.assert_close(few.rgb[0], 0.75 * g.rgb[0] + 0.25 * g.rgb[1])
 
 

@@ -11,11 +11,11 @@ from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.evaluation.loading import load_inputs, load_truth
 from timesplat.evaluation.method_spec import parse_spec
 from timesplat.evaluation.scoring import evaluate_views
-from timesplat.model.fitting.refine import JUDGES, around, error, judging, part, refine, start_size
+from timesplat.model.fitting.fit_views import squared_error
+from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB, Few, part, refine, start_size
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
 from timesplat.model.io.asset import read_ply
-from timesplat.model.reconstruct import reconstruct_views
 
 
 @pytest.fixture(scope="module")
@@ -33,26 +33,26 @@ def spoilt(g: Gaussians4D) -> Gaussians4D:
     return replace(g, xyz=xyz, rgb=0.6 * g.rgb + 0.2, opacity=0.5 * g.opacity)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_other_views_get_better_by_a_number_of_steps(scene, near):
+@pytest.mark.parametrize("has_depth", [False, True])
+def test_other_views_get_better_by_a_number_of_steps(scene, has_depth):
     inputs, others = scene
     start = spoilt(lift(inputs))
     copy = start.map(torch.clone)
     with torch.inference_mode():
         told = []
-        g = refine(start, inputs, 0, near=near, steps=30, progress=lambda f, text: told.append(f))
-    assert error(g, others) < (0.85 if near else 0.6) * error(start, others)
+        g = refine(start, inputs, 0, has_depth=has_depth, steps=30, progress=lambda f, text: told.append(f))
+    assert squared_error(g, others) < (0.85 if has_depth else 0.6) * squared_error(start, others)
     assert g.alive().any() and all(torch.isfinite(x).all() for x in (g.xyz, g.scale, g.opacity))
     assert told[-1] == 1 and torch.equal(start.xyz, copy.xyz) and torch.equal(start.opacity, copy.opacity)
-    again = refine(start, inputs, 0, near=near, steps=30)
+    again = refine(start, inputs, 0, has_depth=has_depth, steps=30)
     torch.testing.assert_close(again.xyz, g.xyz)
 
 
 def test_what_gets_no_better_stays(scene, monkeypatch):
     inputs, _ = scene
     start = lift(inputs)
-    monkeypatch.setattr("timesplat.model.fitting.refine.photographs", lambda step: 10 * step.alpha.mean())
-    assert refine(start, inputs, 0, near=True, steps=8) is start
+    monkeypatch.setattr("timesplat.model.fitting.refine.photometric_loss", lambda step: 10 * step.alpha.mean())
+    assert refine(start, inputs, 0, has_depth=True, steps=8) is start
     assert refine(start, inputs, 0.0) is start
     none = replace(start, opacity=0 * start.opacity)
     assert refine(none, inputs, 1.0) is none and refine(start[:0], inputs, 1.0).xyz.shape == (0, 3)
@@ -64,42 +64,28 @@ def test_rgb_starts_from_small_pictures(spheres):
     assert start_size(large[:5]).size == (200, 200)  # fewer are not fitted
 
 
-def test_views_that_judge_are_spread_over_the_clip(scene):
+def test_too_few_views_of_rgb_are_not_fitted(scene):
     inputs, _ = scene
-    assert judging(inputs).tolist() == [3, 9, 15, 21] and len(judging(inputs)) == JUDGES
-    assert judging(inputs[:3]).tolist() == [0, 1, 2] and judging(inputs[:1]).tolist() == [0]
-    assert isinstance(refine(lift(inputs[:3]), inputs[:3], 0, steps=3, near=True), Gaussians4D)
-    few = lift(inputs[:5])
-    assert refine(few, inputs[:5], 0, steps=3) is few
+    assert isinstance(refine(lift(inputs[:3]), inputs[:3], 0, steps=3, has_depth=True), Gaussians4D)
+    start = lift(inputs[:5])
+    assert refine(start, inputs[:5], 0, steps=3) is start
 
 
-def test_pictures_from_around_are_what_the_gaussians_look_like(scene):
-    inputs, _ = scene
-    g = lift(inputs)
-    views = around(g, inputs, seed=3, count=5)
-    assert len(views) == 5 and views.size == inputs.size
-    assert all((inputs.time - t).abs().min() < 1e-5 for t in views.time)
-    between = around(g, inputs[[4, 12]], seed=3, count=60).time  # frames that no view shows
-    assert (
-        between.unique().numel() > 5
-        and between.min() >= inputs.time[4] - 1e-5
-        and between.max() <= inputs.time[12] + 1e-5
-    )
-    assert around(g, inputs[[4]], count=3).time.tolist() == [float(inputs.time[4])] * 3
-    assert error(g, views) < 1e-6  # over white, as they were drawn
-    torch.testing.assert_close(views.c2w[:, :3, 3].norm(dim=-1), inputs.c2w[:5, :3, 3].norm(dim=-1))
-    torch.testing.assert_close(torch.linalg.det(views.c2w[:, :3, :3]), torch.ones(5))
-    torch.testing.assert_close(around(g, inputs, seed=3, count=5).rgb, views.rgb)
-    assert (around(g, inputs, seed=4, count=5).c2w - views.c2w).abs().max() > 0.1
+def test_limits_follow_the_pictures(spheres):
+    views = spheres([0], size=64)
+    assert FROM_RGB.limit(views) == 3000 and FROM_DEPTH.limit(views) == 2000
+    assert Few.of(True) is FROM_DEPTH and Few.of(False) is FROM_RGB
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_a_count_is_kept_even_where_the_start_was_better(scene, near):
+@pytest.mark.parametrize("has_depth", [False, True])
+def test_a_number_is_kept_even_where_the_start_was_better(scene, has_depth):
     inputs, others = scene
     start = lift(inputs)
     told = []
-    g = refine(start, inputs, 0, near=near, steps=60, count=200, progress=lambda f, text: told.append(f))
-    assert len(g) <= 200 < len(start) / 5 and error(g, others) < 0.01
+    g = refine(
+        start, inputs, 0, has_depth=has_depth, steps=60, max_gaussians=200, progress=lambda f, text: told.append(f)
+    )
+    assert len(g) <= 200 < len(start) / 5 and squared_error(g, others) < 0.01
     assert told == sorted(told) and told[-1] == 1
     assert part(None, 0, 1) is None
 
@@ -108,7 +94,7 @@ def test_refusals(scene):
     inputs, _ = scene
     for seconds in (-1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="seconds of refinement: give 0 or more"):
-            reconstruct_views(inputs, "hull", refine=seconds)
+            refine(lift(inputs), inputs, seconds)
     with pytest.raises(InputError, match="of another kind"):
         refine(object(), inputs, 1.0)
 

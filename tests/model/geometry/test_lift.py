@@ -125,7 +125,7 @@ def dancer(tmp_path_factory):
         weights = np.concatenate([1 - weights.sum(1, keepdims=True), weights], 1)
         return np.einsum("nc,fncx->fnx", weights, posed[:, corners])
 
-    return load_views(seq, range(24), passes=True), track
+    return load_views(seq, range(24), has_depth=True), track
 
 
 def test_velocities_and_later_places_are_those_of_the_mesh(dancer, monkeypatch):

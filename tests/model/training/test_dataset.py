@@ -15,7 +15,7 @@ def test_packed_views_are_the_rendered_ones(sphere_folder, tmp_path):
     seq = read_sequence(sphere_folder)
     clips = ClipDataset([sphere_folder.parent], tmp_path)
     sample = clips.sample(np.random.default_rng(0), targets=2)
-    whole = load_views(seq, range(len(seq.views)), passes=True)
+    whole = load_views(seq, range(len(seq.views)), has_depth=True)
     for part in (sample.inputs, sample.targets):
         for i in range(len(part)):
             n = next(

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What gradient descent changes: raw tensors with Adam's moments, and the Gaussians that raw tensors stand for."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..gaussians import Gaussians4D
+
+BETAS, EPSILON = (0.9, 0.99), 1e-10  # Adam's; a shorter memory than usual, for hundreds of steps
+# Learning rates of Gaussians that are free to go anywhere, at the start and at the end of a fit.
+RATES = {
+    "xyz": (4e-3, 4e-4),
+    "t": (2e-3, 2e-4),
+    "velocity": (1e-2, 1e-3),
+    "sigma_t": (1e-2, 1e-3),
+    "scale": (2e-2, 5e-3),
+    "rotation": (1e-2, 2e-3),
+    "rgb": (2e-2, 4e-3),
+    "opacity": (1e-1, 2e-2),
+}
+
+
+class Parameters:
+    """Raw tensors by name, each with Adam's moments beside and a learning rate that decays exponentially. Rows can be
+    added and taken away between steps.
+
+    `parameters[name]` is the leaf that gradients reach."""
+
+    def __init__(self, values: dict[str, Tensor], rates: dict[str, tuple[float, float]]):
+        """values: name -> tensor of any shape; rates: name -> learning rate at the start and at the end of the
+        budget."""
+        self.rates = rates
+        self.values = {k: v.detach().clone().requires_grad_() for k, v in values.items()}
+        self.moments = {k: (torch.zeros_like(v), torch.zeros_like(v)) for k, v in self.values.items()}
+        self.steps = 0
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self.values[name]
+
+    @torch.no_grad()
+    def step(self, fraction: float) -> None:
+        """One step of Adam (Kingma and Ba 2015) along the gradients, `fraction` 0..1 of the budget being spent.
+        Entries whose gradient is not finite count as 0."""
+        self.steps += 1
+        a, b = BETAS
+        for k, v in self.values.items():
+            first, last = self.rates[k]
+            if v.grad is None or first == 0:
+                continue
+            g, (m, s) = v.grad.nan_to_num_(0, 0, 0), self.moments[k]
+            m.lerp_(g, 1 - a)
+            s.mul_(b).addcmul_(g, g, value=1 - b)
+            scale = first * (last / first) ** fraction / (1 - a**self.steps)
+            v.addcdiv_(m, (s / (1 - b**self.steps)).sqrt_().add_(EPSILON), value=-scale)
+            v.grad = None
+
+    @torch.no_grad()
+    def keep_rows(self, keep: Tensor) -> None:
+        """Keeps the rows `keep` ((K,) indices, repeats allowed, or a mask (N,)) of every tensor, with their gradients
+        and moments."""
+        for k, old in self.values.items():
+            self.values[k] = old.detach()[keep].clone().requires_grad_()
+            self.values[k].grad = None if old.grad is None else old.grad[keep]
+            self.moments[k] = tuple(m[keep].clone() for m in self.moments[k])
+
+    @torch.no_grad()
+    def reset_moments(self, rows: Tensor) -> None:
+        """Sets Adam's moments of these rows ((K,) indices or mask (N,)) to 0, as for newly made ones."""
+        for moments in self.moments.values():
+            for m in moments:
+                m[rows] = 0
+
+
+def activate(raw: dict[str, Tensor]) -> Gaussians4D:
+    """Raw parameters, named and shaped as the fields of Gaussians4D (N,…), -> Gaussians (N,)."""
+    return Gaussians4D(
+        xyz=raw["xyz"],
+        t=raw["t"],
+        velocity=raw["velocity"],
+        sigma_t=raw["sigma_t"].exp(),
+        scale=raw["scale"].exp(),
+        rotation=F.normalize(raw["rotation"], dim=-1),
+        rgb=raw["rgb"],
+        opacity=torch.sigmoid(raw["opacity"]),
+    )
+
+
+def raw_parameters(g: Gaussians4D, min_sigma_t: float = 1e-6, fade: float = 1.0) -> dict[str, Tensor]:
+    """Gaussians (N,) -> the raw parameters of which `activate` makes them; σ_t is raised to `min_sigma_t`, opacity
+    multiplied by `fade` and kept within 0.01..0.99."""
+    return {
+        "xyz": g.xyz,
+        "t": g.t,
+        "velocity": g.velocity,
+        "sigma_t": g.sigma_t.clamp_min(min_sigma_t).log(),
+        "scale": g.scale.clamp_min(1e-6).log(),
+        "rotation": g.rotation,
+        "rgb": g.rgb,
+        "opacity": (fade * g.opacity).clamp(0.01, 0.99).logit(),
+    }

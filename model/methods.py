@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The ways from Views to a scene, by name: what each is, what it needs, and how it is run.
+
+The product's own are here. Those that it is compared with add themselves when `model.baselines` is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from ..datagen.sequence import InputError
+from .gaussians import Gaussians4D, Moving
+from .views import Views
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """How a scene is reconstructed. Raises InputError for seconds and budgets that are none."""
+
+    device: str = "cpu"  # of networks, as torch names it; fits take the processor where it has no rasteriser
+    checkpoint: Path | None = None  # weights in place of the shipped ones
+    seconds: float = 10.0  # that methods which fit a scene may take
+    refine: float = 0.0  # seconds for which the result is then fitted to the views
+    budget: str | None = None  # most Gaussians: "N", "P%" or "auto"
+    max_loss: float = 0.1  # dB that "auto" may lose
+    dense: bool = False  # a network's tokens everywhere, and not only where the object is
+
+    def __post_init__(self):
+        if self.refine or self.budget:  # refuse now what else is found out after seconds
+            from .fitting.budget import parse_budget
+            from .fitting.refine import check_seconds
+
+            check_seconds(self.refine)
+            if self.budget:
+                parse_budget(self.budget)
+
+
+Progress = Callable[[float, str], None]  # fraction 0..1, what is done
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way from Views to a scene."""
+
+    name: str
+    about: str  # what it is and whose
+    # (views, options, progress): options.checkpoint is what to load, progress is called by what takes seconds
+    run: Callable[[Views, ReconstructOptions, Progress | None], Gaussians4D | Moving]
+    has_depth: bool = False  # sees depth and motion vectors; else RGB and alpha alone
+    fits: bool = False  # to the scene, for some seconds
+    baseline: bool = False  # what the product is compared with
+    checkpoint: str | None = None  # name of the shipped weights that it loads
+    knows_surface: bool = False  # its Gaussians know which way their surface faces
+
+
+METHODS: dict[str, Method] = {}
+
+
+def register(*methods: Method) -> None:
+    """Adds methods to METHODS."""
+    METHODS.update({m.name: m for m in methods})
+
+
+def method_named(name: str) -> Method:
+    """Raises InputError where there is none of this name."""
+    if name not in METHODS:
+        raise InputError(f"{name}: no such method; choose one of {', '.join(METHODS)}.")
+    return METHODS[name]
+
+
+def run_lift(views: Views, options: ReconstructOptions, progress: Progress | None) -> Gaussians4D:
+    from .geometry.lift import lift
+
+    return lift(views)
+
+
+def load_predictor(options: ReconstructOptions) -> Callable[[Views], Gaussians4D]:
+    """The network of options.checkpoint, from Views to Gaussians. Raises InputError as `load_network` does."""
+    from .checkpoints_io import load_network
+    from .inference import apply_network
+
+    network = load_network(options.checkpoint, options.device)
+    return partial(apply_network, network, device=options.device, drop_empty=not options.dense)
+
+
+def run_network(views: Views, options: ReconstructOptions, progress: Progress | None) -> Gaussians4D:
+    return load_predictor(options)(views)
+
+
+register(
+    Method(
+        "lift",
+        "ours: depth and motion vectors to Gaussians, no network",
+        run_lift,
+        has_depth=True,
+        knows_surface=True,
+    ),
+    Method(
+        "guided",
+        "ours: the network over depth and motion vectors",
+        run_network,
+        has_depth=True,
+        checkpoint="guided",
+        knows_surface=True,
+    ),
+    Method(
+        "rgb",
+        "ours: the network over RGB alone: the better of `sweep` and `predicted` on held-out objects",
+        run_network,
+        checkpoint="sweep",
+        knows_surface=True,
+    ),
+    Method(
+        "sweep",
+        "ours: the network over RGB with depths swept from the other views",
+        run_network,
+        checkpoint="sweep",
+        knows_surface=True,
+    ),
+    Method(
+        "predicted",
+        "the paper's network over RGB, token dropping on",
+        run_network,
+        baseline=True,
+        checkpoint="predicted",
+    ),
+)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Parameters: Adam as torch has it, rows that come and go; raw tensors and back."""
+
+import torch
+
+from timesplat.model.fitting.parameters import BETAS, EPSILON, RATES, Parameters, activate, raw_parameters
+from timesplat.model.gaussians import FIELDS
+from timesplat.model.geometry.lift import lift
+
+
+def test_adam_is_torchs_and_rates_decay():
+    torch.manual_seed(0)
+    start, goal = torch.randn(5, 3), torch.randn(5, 3)
+    p = Parameters({"a": start, "fixed": start}, {"a": (0.1, 0.001), "fixed": (0.0, 0.0)})
+    theirs = torch.nn.Parameter(start.clone())
+    adam = torch.optim.Adam([theirs], betas=BETAS, eps=EPSILON)
+    for i in range(10):
+        adam.param_groups[0]["lr"] = 0.1 * 0.01 ** (i / 10)
+        for x in (theirs, p["a"]):
+            ((x - goal) ** 2).sum().backward()
+        adam.step()
+        adam.zero_grad()
+        p.step(i / 10)
+    torch.testing.assert_close(p["a"], theirs, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(p["fixed"].detach(), start, rtol=0, atol=0)
+
+
+def test_rows_take_their_moments_along_and_nan_moves_nothing():
+    p = Parameters({"a": torch.zeros(4), "b": torch.zeros(4, 2)}, {"a": (1.0, 1.0), "b": (1.0, 1.0)})
+    (p["a"] * torch.arange(4.0)).sum().backward()
+    p.keep_rows(torch.tensor([3, 3, 1]))
+    assert p["a"].grad.tolist() == [3, 3, 1] and p["b"].shape == (3, 2) and p["b"].grad is None
+    p["a"].grad[2] = torch.nan
+    p.step(0.0)
+    assert p["a"].tolist() == [-1, -1, 0] and p["a"].requires_grad
+    p.reset_moments(torch.tensor([0]))
+    assert p.moments["a"][0][0] == 0 and p.moments["a"][0][1] != 0
+
+
+def test_raw_parameters_activate_to_the_same_gaussians(spheres):
+    g = lift(spheres([0, 8], size=32)).with_axes()
+    back = activate(raw_parameters(g))
+    assert list(RATES) == FIELDS
+    for k in FIELDS:
+        expected = g.opacity.clamp(0.01, 0.99) if k == "opacity" else getattr(g, k)
+        torch.testing.assert_close(getattr(back, k), expected, atol=1e-5, rtol=1e-4)
+    longer = activate(raw_parameters(g, min_sigma_t=0.5, fade=0.3))
+    assert longer.sigma_t.min() > 0.499 and longer.opacity.max() < 0.31
