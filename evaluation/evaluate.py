@@ -28,7 +28,7 @@ from ..model.fitting.budget import parse as parse_budget
 from ..model.gaussians import Gaussians4D, Moving
 from ..model.parallel import clock
 from ..model.rasterize import render
-from ..model.rasterize.timeline import WORTH, Timeline
+from ..model.rasterize.lifetime_index import QUICKER_FROM, LifetimeIndex
 from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
 from ..model.training.dataset import shrink
 from ..model.views import Views, load_views
@@ -131,8 +131,8 @@ def draw(g: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
     """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
     paper's inference filters."""
     height, width = views.size
-    if isinstance(g, Gaussians4D) and len(g) > WORTH:
-        g = Timeline(g)
+    if isinstance(g, Gaussians4D) and len(g) > QUICKER_FROM:
+        g = LifetimeIndex(g)
     with torch.no_grad():
         return render(g, views.c2w, views.intrinsics, views.time, width, height, inference=True)
 

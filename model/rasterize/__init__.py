@@ -18,12 +18,6 @@ from torch import Tensor
 from ..gaussians import Gaussians4D, Moving
 
 BACKENDS = ("cpu", "cuda", "triton", "reference")
-NEAR = 0.01  # nearest depth of a centre
-BLUR = 0.3  # px², added to the 2D covariance's diagonal
-MARGIN = 0.3  # the Jacobian's slopes are clamped to the image widened by this share of half its size
-ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.999  # fainter is not drawn, denser is clamped
-T_STOP = 1e-4  # a pixel stops before its transmittance gets this low
-FILTER = 0.05  # the paper's inference filters, on the marginal and on the weighted opacity (appendix A.2)
 
 
 def rasterize(

@@ -19,8 +19,9 @@ import numpy as np
 import torch
 
 from ..parallel import each
-from . import ALPHA_MAX, T_STOP, project
+from . import project
 from .chain import chain
+from .constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from .project import (
     BLUE, E_MIN, F32, GREEN, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE, UX, UY, VY, serial,
 )  # fmt: skip
@@ -31,7 +32,7 @@ CELL, ACROSS = 8, TILE // 8  # a tile is ACROSS² cells of CELL² pixels, so tha
 # seven pixels over the tile's right edge, into scratch.
 PLANE = (TILE + 8) * ROWS
 HALF, SLACK = F32(0.5), F32(1e-3)  # slack: rounding of a span's ends; the pixels decide exactly
-HIGHEST, STOP, ZERO = F32(ALPHA_MAX), F32(T_STOP), F32(0)
+HIGHEST, STOP, ZERO = F32(ALPHA_MAX), F32(TRANSMITTANCE_MIN), F32(0)
 WIDE = 32  # from this width on (pixels, less one) each row finds its own span; at 8 it took a half longer than it saved
 AHEAD = 8  # Gaussians: how far ahead memory is asked for
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from . import ALPHA_MIN, FILTER, NEAR
+from .constants import ALPHA_MIN, INFERENCE_MIN, NEAR_PLANE
 
 
 def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsics, time, size, background, inference):
@@ -30,7 +30,7 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
         o = opacity * marginal
         keep = o >= ALPHA_MIN
         if inference:
-            keep &= (marginal >= FILTER) & (o >= FILTER)
+            keep &= (marginal >= INFERENCE_MIN) & (o >= INFERENCE_MIN)
         keep = keep.nonzero()[:, 0]
         if not len(keep):
             nothing = 0 * rgb[keep].sum()  # zero, but part of the graph
@@ -47,7 +47,7 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
             Ks=K[view : view + 1],
             width=width,
             height=height,
-            near_plane=NEAR,
+            near_plane=NEAR_PLANE,
             covars=symmetric[keep].float(),
             backgrounds=background.float()[None],
             rasterize_mode="classic",

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from . import ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR
+from .constants import ALPHA_MIN, BLUR, INFERENCE_MIN, NEAR_PLANE, SLOPE_MARGIN
 from .simd import bits, gather, log2, select, splat, sqrt, store
 
 TILE = 64  # pixels a side
 F32 = np.float32
 LOG2E = math.log2(math.e)
 E_MIN = F32(math.log2(ALPHA_MIN))
-E_FILTER = math.log2(FILTER)
-_SHARED = b"".join((Path(__file__).parent / name).read_bytes() for name in ("__init__.py", "simd.py", "project.py"))
+E_FILTER = math.log2(INFERENCE_MIN)
+_SHARED = b"".join((Path(__file__).parent / name).read_bytes() for name in ("constants.py", "simd.py", "project.py"))
 _SHARED = hashlib.sha256(_SHARED).hexdigest()[:16]
 
 
@@ -72,7 +72,7 @@ def _cull(now, t, sigma_t, opacity, inference):
 def _camera(c, c2w, intrinsics, width, height):
     """In all lanes: axes x y z (3 each), centre (3), fx fy cx cy, and the slopes' bounds in x and y."""
     fx, fy, cx, cy = intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3]
-    mx, my = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+    mx, my = SLOPE_MARGIN * 0.5 * width / fx, SLOPE_MARGIN * 0.5 * height / fy
     return (
         (splat(c2w[c, 0, 0]), splat(c2w[c, 1, 0]), splat(c2w[c, 2, 0])),
         (splat(c2w[c, 0, 1]), splat(c2w[c, 1, 1]), splat(c2w[c, 2, 1])),
@@ -174,7 +174,7 @@ def _prepare(
     camera = _camera(c, c2w, intrinsics, width, height)
     now, one, zero = splat(time[c]), splat(1.0), splat(0.0)
     scale, least, filtered = splat(math.sqrt(0.5 * LOG2E)), splat(np.float64(E_MIN)), splat(E_FILTER)
-    w, h, near = splat(np.float64(width)), splat(np.float64(height)), splat(np.float64(NEAR))
+    w, h, near = splat(np.float64(width)), splat(np.float64(height)), splat(np.float64(NEAR_PLANE))
     lanes, kept = np.zeros(PARAMS * 8, np.float32), 0
     for at in range(0, count, 8):
         o = gather(opacity, ids, at, 1, 0)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from . import ALPHA_MAX, ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR, T_STOP
+from .constants import ALPHA_MAX, ALPHA_MIN, BLUR, INFERENCE_MIN, NEAR_PLANE, SLOPE_MARGIN, TRANSMITTANCE_MIN
 
 
 def project(mean, covariance, c2w, intrinsics, width, height):
@@ -17,8 +17,8 @@ def project(mean, covariance, c2w, intrinsics, width, height):
     W = c2w[:3, :3].T
     x, y, z = ((mean - c2w[:3, 3]) @ W.T).unbind(-1)
     fx, fy, cx, cy = intrinsics
-    z = torch.where(z >= NEAR, z, torch.ones_like(z))  # those behind are dropped by the caller; no NaN from here
-    mx, my = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+    z = torch.where(z >= NEAR_PLANE, z, torch.ones_like(z))  # those behind are dropped by the caller; no NaN from here
+    mx, my = SLOPE_MARGIN * 0.5 * width / fx, SLOPE_MARGIN * 0.5 * height / fy
     sx = torch.clamp(x / z, -cx / fx - mx, (width - cx) / fx + mx)
     sy = torch.clamp(y / z, -cy / fy - my, (height - cy) / fy + my)
     zero = torch.zeros_like(z)
@@ -44,9 +44,9 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
         marginal = torch.exp(-0.5 * (dt / sigma_t) ** 2)
         o = opacity * marginal
         z = (mean - c2w[view, :3, 3]) @ c2w[view, :3, 2]
-        keep = (z >= NEAR) & (o >= ALPHA_MIN)
+        keep = (z >= NEAR_PLANE) & (o >= ALPHA_MIN)
         if inference:
-            keep &= (marginal >= FILTER) & (o >= FILTER)
+            keep &= (marginal >= INFERENCE_MIN) & (o >= INFERENCE_MIN)
         keep = keep.nonzero()[:, 0]
         # front to back by the depth of the centre in float32; equal depths in input order
         keep = keep[torch.argsort(z[keep].detach().float(), stable=True)]
@@ -58,7 +58,7 @@ def rasterize(xyz, t, velocity, sigma_t, covariance, rgb, opacity, c2w, intrinsi
         alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
         # A Gaussian that would take the transmittance to 1e-4 or below is not drawn, nor is any behind it.
         after = torch.cumprod(1 - alpha.detach(), -1)
-        alpha = torch.where(after > T_STOP, alpha, torch.zeros_like(alpha))
+        alpha = torch.where(after > TRANSMITTANCE_MIN, alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha, -1)
         before = torch.cat([torch.ones_like(after[..., :1]), after], -1)[..., :-1]
         left = 1 - (alpha * before).sum(-1) if len(keep) else torch.ones(height, width, dtype=dtype)

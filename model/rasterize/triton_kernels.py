@@ -23,12 +23,12 @@ try:
 except ImportError as e:
     raise ImportError("rasterizing on CUDA without gsplat needs triton, a part of torch for CUDA on Linux") from e
 
-from . import ALPHA_MAX, ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR, T_STOP
+from .constants import ALPHA_MAX, ALPHA_MIN, BLUR, INFERENCE_MIN, NEAR_PLANE, SLOPE_MARGIN, TRANSMITTANCE_MIN
 
 LOG2E = math.log2(math.e)
 TILE, GROUP = tl.constexpr(16), tl.constexpr(8)  # pixels a side; Gaussians that a tile takes at once
-NEAREST, BLURRED, FILTERED = tl.constexpr(NEAR), tl.constexpr(BLUR), tl.constexpr(FILTER)
-LOWEST, HIGHEST, STOP = tl.constexpr(ALPHA_MIN), tl.constexpr(ALPHA_MAX), tl.constexpr(T_STOP)
+NEAREST, BLURRED, FILTERED = tl.constexpr(NEAR_PLANE), tl.constexpr(BLUR), tl.constexpr(INFERENCE_MIN)
+LOWEST, HIGHEST, STOP = tl.constexpr(ALPHA_MIN), tl.constexpr(ALPHA_MAX), tl.constexpr(TRANSMITTANCE_MIN)
 E_MIN, SCALE = tl.constexpr(math.log2(ALPHA_MIN)), tl.constexpr(0.5 * LOG2E)
 UNSCALE, MOMENT = tl.constexpr(2 / LOG2E), tl.constexpr(2 / LOG2E**2)
 # A camera is a row of float64: c2w's upper three rows, fx fy cx cy, bounds of the slopes x0 x1 y0 y1, time.
@@ -356,7 +356,7 @@ def _cameras(c2w, intrinsics, time, width, height, device):
     c2w, intrinsics, time = (x.detach().to(device, torch.float64) for x in (c2w, intrinsics, time))
     f, centre = intrinsics[:, :2], intrinsics[:, 2:]
     size = torch.tensor([width, height], dtype=torch.float64, device=device)
-    low, high = -centre / f - MARGIN * 0.5 * size / f, (size - centre) / f + MARGIN * 0.5 * size / f
+    low, high = -centre / f - SLOPE_MARGIN * 0.5 * size / f, (size - centre) / f + SLOPE_MARGIN * 0.5 * size / f
     bounds = torch.stack([low, high], -1).flatten(1)
     return torch.cat([c2w[:, :3].flatten(1), intrinsics, bounds, time[:, None]], 1).contiguous()
 
