@@ -11,6 +11,8 @@ from torch import Tensor
 
 from ..datagen.sequence import Sequence
 
+BACKGROUND = 1.0  # white: what pictures are laid on where nothing else is said
+
 
 @dataclass
 class Views:
@@ -41,7 +43,7 @@ class Views:
         """Height, width."""
         return self.rgb.shape[1], self.rgb.shape[2]
 
-    def over(self, background: float | Tensor = 1.0) -> Tensor:
+    def over(self, background: float | Tensor = BACKGROUND) -> Tensor:
         """(V,H,W,3) the pictures composited over a background (scalar or (3,)), white by default."""
         a = self.alpha[..., None]
         return self.rgb * a + background * (1 - a)
