@@ -32,7 +32,7 @@ from timesplat.evaluation.tables import machine
 from timesplat.model.gaussians import FIELDS, Gaussians4D
 from timesplat.model.io.asset import read_ply
 from timesplat.model.rasterize import render
-from timesplat.model.rasterize.simd import ROWS
+from timesplat.model.rasterize.cpu.simd import ROWS
 
 VISIBLE = 1 / 255
 NAMES = ("scene", "gaussians", "pixels", "views", "forward_ms", "both_ms", "inference_ms", "floor_ms")
@@ -67,13 +67,6 @@ def ring(size: int, views: int):
     f = 0.5 * size / math.tan(math.radians(25))
     K = torch.tensor([f, f, size / 2, size / 2]).expand(views, 4)
     return torch.stack(poses), K, torch.linspace(-0.8, 0.8, views), size, size
-
-
-def scene(n: int, size: int, views: int) -> tuple[list[torch.Tensor], tuple]:
-    """`cloud` as the seven leaves that `rasterize` takes, and `ring`."""
-    g = cloud(n)
-    leaves = (g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity)
-    return [x.requires_grad_() for x in leaves], ring(size, views)
 
 
 def floor(g: Gaussians4D, view) -> float:

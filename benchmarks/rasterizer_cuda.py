@@ -18,20 +18,22 @@ from functools import partial
 
 import torch
 
-from timesplat.benchmarks.rasterizer import scene
-from timesplat.model.rasterize import rasterize
+from timesplat.benchmarks.rasterizer import cloud, ring
+from timesplat.model.gaussians import FIELDS, Gaussians4D
+from timesplat.model.rasterize import render
 
 
-def run(g, view, backend, backward):
+def run(g: Gaussians4D, view, backend: str, backward: bool) -> list[torch.Tensor]:
     """-> [rgb, alpha], or with the gradients of mean(rgb) + mean(alpha); waits for the card."""
-    for x in g:
+    leaves = [getattr(g, k) for k in FIELDS]
+    for x in leaves:
         x.grad = None
     with torch.set_grad_enabled(backward):
-        out = rasterize(*g, *view, backend=backend)
+        out = render(g, *view, backend=backend)
     if backward:
         (out[0].mean() + out[1].mean()).backward()
-        out = [*out, *(x.grad for x in g)]
-    if g[0].is_cuda:
+        out = [*out, *(x.grad for x in leaves)]
+    if g.xyz.is_cuda:
         torch.cuda.synchronize()
     return [x.detach() for x in out]
 
@@ -56,16 +58,15 @@ def main():
         print("This benchmark needs an NVIDIA GPU and a torch built for CUDA.")
         sys.exit(2)
 
-    backends = ["cpu", "triton"] + ["cuda"] * bool(importlib.util.find_spec("gsplat"))
+    backends = ["cpu", "triton"] + ["gsplat"] * bool(importlib.util.find_spec("gsplat"))
     print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {torch.get_num_threads()} threads for cpu")
     print("Gaussians  image backend | first s  fwd ms fwd+bwd ms | from cpu: image  gradients")
     for n, size in (map(int, s.split("x")) for s in args.sizes.split(",")):
         reference = None
         for backend in backends:
             device = "cpu" if backend == "cpu" else "cuda"
-            g, view = scene(n, size, args.views)
-            g = [x.detach().to(device).requires_grad_() for x in g]
-            view = [x.to(device) if isinstance(x, torch.Tensor) else x for x in view]
+            g = cloud(n).map(lambda x: x.to(device).requires_grad_())  # noqa: B023
+            view = [x.to(device) if isinstance(x, torch.Tensor) else x for x in ring(size, args.views)]
             start = time.perf_counter()
             out = [x.cpu() for x in run(g, view, backend, True)]
             first = time.perf_counter() - start
