@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import math
 import sys
 import time
 from functools import partial
 
 import torch
 
-from timesplat.benchmarks.rasterizer import cloud, ring
+from timesplat.benchmarks.rasterizer import cameras, cloud
+from timesplat.benchmarks.timing import least
 from timesplat.model.gaussians import FIELDS, Gaussians4D
 from timesplat.model.rasterize import render
 
@@ -36,16 +36,6 @@ def run(g: Gaussians4D, view, backend: str, backward: bool) -> list[torch.Tensor
     if g.xyz.is_cuda:
         torch.cuda.synchronize()
     return [x.detach() for x in out]
-
-
-def best(f, seconds):
-    """Least wall-ms of f over about `seconds`, at least three calls."""
-    least, end, calls = math.inf, time.perf_counter() + seconds, 0
-    while calls < 3 or time.perf_counter() < end:
-        start = time.perf_counter()
-        f()
-        least, calls = min(least, time.perf_counter() - start), calls + 1
-    return 1e3 * least
 
 
 def main():
@@ -66,15 +56,15 @@ def main():
         for backend in backends:
             device = "cpu" if backend == "cpu" else "cuda"
             g = cloud(n).map(lambda x: x.to(device).requires_grad_())  # noqa: B023
-            view = [x.to(device) if isinstance(x, torch.Tensor) else x for x in ring(size, args.views)]
+            view = [x.to(device) if isinstance(x, torch.Tensor) else x for x in cameras(args.views, size)]
             start = time.perf_counter()
             out = [x.cpu() for x in run(g, view, backend, True)]
             first = time.perf_counter() - start
             reference = reference or out
             image = max((a - b).abs().max().item() for a, b in zip(out[:2], reference[:2], strict=True))
             worst = max(((a - b).norm() / b.norm()).item() for a, b in zip(out[2:], reference[2:], strict=True))
-            forward = best(partial(run, g, view, backend, False), args.seconds)
-            both = best(partial(run, g, view, backend, True), args.seconds)
+            calls = (partial(run, g, view, backend, backward) for backward in (False, True))
+            forward, both = (1e3 * least(call, args.seconds, time.perf_counter) for call in calls)
             print(f"{n:9d} {size:5d}² {backend:>7} | {first:7.2f} {forward:7.2f} {both:10.2f} |", end="")
             print(f" {image:15.1e} {worst:10.1e}")
 

@@ -96,7 +96,7 @@ def test_benchmarks_are_modules_of_the_package(name):
         pytest.skip(f"{missing} is not installed")
 
 
-@pytest.mark.parametrize("name", ["gpu", "rasterize"])
+@pytest.mark.parametrize("name", ["rasterizer", "rasterizer_cuda"])
 def test_benchmarks_are_scripts_too(name):
     pytest.importorskip("torch")
     command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--help"]
