@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Triton backend's kernels: cull, project, blend, and the way back (triton.py calls them in this order)."""
+"""The Triton backend's kernels: cull, project, blend, and the way back (triton.py calls them in this order).
+
+All take pointers to contiguous float32: xyz (N,3), t (N), velocity (N,3), sigma_t (N), cov (N,3,3), rgb (N,3),
+opacity (N), background (3,), image (C,H,W,3), alpha (C,H,W), and of each the gradient, g_…; cameras are float64."""
 
 from __future__ import annotations
 
@@ -8,13 +11,16 @@ import math
 import triton
 import triton.language as tl
 
-from .constants import ALPHA_MAX, ALPHA_MIN, BLUR, INFERENCE_MIN, NEAR_PLANE, TRANSMITTANCE_MIN
+from . import constants
 
 LOG2E = math.log2(math.e)
 TILE, GROUP = tl.constexpr(16), tl.constexpr(8)  # pixels a side; Gaussians that a tile takes at once
-NEAREST, BLURRED, FILTERED = tl.constexpr(NEAR_PLANE), tl.constexpr(BLUR), tl.constexpr(INFERENCE_MIN)
-LOWEST, HIGHEST, STOP = tl.constexpr(ALPHA_MIN), tl.constexpr(ALPHA_MAX), tl.constexpr(TRANSMITTANCE_MIN)
-E_MIN, SCALE = tl.constexpr(math.log2(ALPHA_MIN)), tl.constexpr(0.5 * LOG2E)
+# The shared limits, as kernels can see them.
+NEAR_PLANE, BLUR = tl.constexpr(constants.NEAR_PLANE), tl.constexpr(constants.BLUR)
+ALPHA_MIN, ALPHA_MAX = tl.constexpr(constants.ALPHA_MIN), tl.constexpr(constants.ALPHA_MAX)
+TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
+INFERENCE_MIN = tl.constexpr(constants.INFERENCE_MIN)
+LOG_ALPHA_MIN, SCALE = tl.constexpr(math.log2(constants.ALPHA_MIN)), tl.constexpr(0.5 * LOG2E)
 UNSCALE, MOMENT = tl.constexpr(2 / LOG2E), tl.constexpr(2 / LOG2E**2)
 # A camera is a row of float64: c2w's upper three rows, fx fy cx cy, bounds of the slopes x0 x1 y0 y1, time.
 CAMERA = tl.constexpr(21)
@@ -59,9 +65,9 @@ def _flatten(n, camera, px, py, pz, cov):
     ms0, ks0 = m0 * xx + m1 * xy + m2 * xz, k0 * xx + k1 * xy + k2 * xz
     ms1, ks1 = m0 * xy + m1 * yy + m2 * yz, k0 * xy + k1 * yy + k2 * yz
     ms2, ks2 = m0 * xz + m1 * yz + m2 * zz, k0 * xz + k1 * yz + k2 * zz
-    sxx = ms0 * m0 + ms1 * m1 + ms2 * m2 + BLURRED
+    sxx = ms0 * m0 + ms1 * m1 + ms2 * m2 + BLUR
     sxy = ms0 * k0 + ms1 * k1 + ms2 * k2
-    syy = ks0 * k0 + ks1 * k1 + ks2 * k2 + BLURRED
+    syy = ks0 * k0 + ks1 * k1 + ks2 * k2 + BLUR
     return sx, sy, m0, m1, m2, k0, k1, k2, ms0, ms1, ms2, ks0, ks1, ks2, sxx, sxy, syy
 
 
@@ -76,9 +82,9 @@ def cull(xyz, t, velocity, sigma_t, opacity, cameras, depth, count, INFERENCE: t
     dt /= _double(sigma_t, n)
     marginal = tl.exp(-0.5 * dt * dt)
     o = _double(opacity, n) * marginal
-    keep = (z >= NEAREST) & (o >= LOWEST)
+    keep = (z >= NEAR_PLANE) & (o >= ALPHA_MIN)
     if INFERENCE:
-        keep &= (marginal >= FILTERED) & (o >= FILTERED)
+        keep &= (marginal >= INFERENCE_MIN) & (o >= INFERENCE_MIN)
     tl.store(depth + c * count + n, tl.where(keep, z, -1.0).to(tl.float32), mask=here)
 
 
@@ -107,7 +113,7 @@ def project(
     my = _double(camera, 13) * py / pz + _double(camera, 15)
     dt /= _double(sigma_t, n)
     log = tl.log2(_double(opacity, n)) - dt * dt * SCALE
-    q = tl.maximum(log - E_MIN, 0.0) * UNSCALE  # squared Mahalanobis distance where alpha is 1/255
+    q = tl.maximum(log - LOG_ALPHA_MIN, 0.0) * UNSCALE  # squared Mahalanobis distance where alpha is 1/255
     rx, ry = tl.sqrt(q * sxx), tl.sqrt(q * syy)
     det = sxx * syy - sxy * sxy
     seen = here & (det > 0) & (mx + rx > 0) & (mx - rx < width) & (my + ry > 0) & (my - ry < height)
@@ -152,7 +158,7 @@ def _alphas(P, row, here, x, y):
     log = tl.broadcast_to(tl.load(P + 5, mask=here, other=-200.0)[:, None], dx.shape)
     e = tl.fma(-u, u, tl.fma(-v, v, log))
     raw = tl.exp2(e)
-    return u, v, raw, tl.where(e >= E_MIN, tl.minimum(raw, HIGHEST), 0.0)
+    return u, v, raw, tl.where(e >= LOG_ALPHA_MIN, tl.minimum(raw, ALPHA_MAX), 0.0)
 
 
 @triton.jit
@@ -168,12 +174,12 @@ def blend(P, rows, starts, background, image, alpha, left, last, width, height, 
     red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     deep = tl.zeros(x.shape, tl.int32)
     i = start
-    while (i < end) & (tl.max(through, 0) > STOP):
+    while (i < end) & (tl.max(through, 0) > TRANSMITTANCE_MIN):
         here = i + g < end
         row = tl.load(rows + i + g, mask=here, other=0)
         _, _, _, a = _alphas(P, row, here, x, y)
         after = through[None, :] * tl.cumprod(1 - a, 0)
-        drawn = after > STOP
+        drawn = after > TRANSMITTANCE_MIN
         weight = tl.where(drawn, a * after / (1 - a), 0.0)
         T = tl.minimum(T, tl.min(tl.where(drawn, after, 1.0), 0))
         through = tl.min(after, 0)
@@ -221,7 +227,7 @@ def unblend(
         shade += tl.load(P + row * ROW + 8, mask=here, other=0.0)[:, None] * g_blue[None, :]
         shade *= weight
         h = shade - a / (1 - a) * (behind[None, :] + (tl.cumsum(shade, 0, reverse=True) - shade))
-        h = tl.where(raw <= HIGHEST, h, 0.0)  # the clamp stops it
+        h = tl.where(raw <= ALPHA_MAX, h, 0.0)  # the clamp stops it
         out = sums + tl.load(places + start + i, mask=here, other=0).to(tl.int64) * ROW
         tl.store(out, tl.sum(weight * g_red[None, :], 1), mask=here)
         tl.store(out + 1, tl.sum(weight * g_green[None, :], 1), mask=here)

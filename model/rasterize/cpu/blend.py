@@ -199,8 +199,9 @@ def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
 
 @jit
 def blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
-    """Renders the tiles of one view; kept: per tile, the planes of what the transmittance ends at and of the last
-    one drawn, from 1."""
+    """Renders the tiles tiles[0] <= j < tiles[1] of one view, whose P, starts and pairs are those of `project_view`,
+    over background (3,) into image (H,W,3) and alpha (H,W). kept (tiles, TILE // ROWS, 2, PLANE): per tile, the planes
+    of what the transmittance ends at and of the last one drawn, from 1."""
     height, width = alpha.shape
     across = (width + TILE - 1) // TILE
     state, live = np.empty(TILE // ROWS * 5 * PLANE, np.float32), np.empty(ACROSS * ACROSS, np.uint8)
@@ -226,7 +227,8 @@ def blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
 
 @jit
 def unblend_tiles(tiles, P, starts, pairs, slots, background, g_image, g_alpha, kept, sums):
-    """Backward through the tiles of one view."""
+    """Backward through the tiles of one view: from g_image (H,W,3), g_alpha (H,W) and what `blend_tiles` kept to the
+    rows of sums (pairs, SUMS)."""
     height, width = g_alpha.shape
     across = (width + TILE - 1) // TILE
     state, deep = np.zeros(TILE // ROWS * 6 * PLANE, np.float32), np.empty(ACROSS * ACROSS, np.float32)

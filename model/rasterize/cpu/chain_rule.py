@@ -90,8 +90,8 @@ def _add_shape(g_shape, g_rotation, lanes, ids, count):
 
 @jit
 def chain_rule(c, own, ids, first, sums, inputs, cameras, width, height, out):
-    """Adds to the gradients `out` of the inputs what the gradients `sums` of view c's pairs say of the
-    Gaussians own[0] <= n < own[1]."""
+    """Adds to the gradients `out` of the inputs, flat as they are, what the gradients `sums` (pairs, SUMS) of view c
+    say of the Gaussians own[0] <= n < own[1]. ids, first, inputs, cameras: as `project_view` takes and gives them."""
     xyz, t, velocity, sigma_t, shape, rotation, _, opacity = inputs
     g_xyz, g_t, g_velocity, g_sigma, g_shape, g_rotation, g_rgb, g_opacity = out
     c2w, intrinsics, time = cameras

@@ -16,8 +16,8 @@ import numpy as np
 from ..constants import BLUR, INFERENCE_MIN, NEAR_PLANE, SLOPE_MARGIN
 from .jit import jit
 from .layout import (
-    BLUE, DEPTH, GREEN, INVERSE, LOG, LOG2E, LOG_ALPHA_MIN, MX, MY, PARAMS, REACH_X, REACH_Y, RED, SLOPE, TILT, UX, UY,
-    VY,
+    BLUE, DEPTH, GREEN, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, TILT, UX, UY, VY,
+    LOG2E, LOG_ALPHA_MIN, PARAMS,
 )  # fmt: skip
 from .simd import bits, gather, log2, select, splat, sqrt, store
 from .tiles import bin_rows
@@ -37,7 +37,7 @@ def all_finite(arrays):
 
 @jit
 def _cull(now, t, sigma_t, opacity, inference):
-    """Ids of the Gaussians that may be alive at a time, in the order of the input, and seven more to read over the end;
+    """Ids of the Gaussians that may be alive at a time, in the order of the input, and eight more to read over the end;
     how many. A quick look: `_prepare` is exact."""
     ids, count = np.empty(len(t) + 8, np.int32), 0
     most = 2.9958 if inference else 5.5413  # -ln 0.05, ln 255, rounded up
@@ -204,8 +204,11 @@ def _prepare(
 
 @jit
 def project_view(c, inputs, cameras, width, height, inference):
-    """View c -> ids of the K Gaussians in it, in the order of the input, and seven more to read over the end; their
-    rows P (K, PARAMS); and starts, pairs, slots, first: see `bin_rows`."""
+    """View c -> ids of the K Gaussians in it, in the order of the input, and eight more to read over the end; their
+    rows P (K, PARAMS); and starts, pairs, slots, first: see `bin_rows`.
+
+    inputs: float32, flat: xyz (3N), t (N), velocity (3N), sigma_t (N), then scale (3N) and rotation (4N) or Σ_3 (9N)
+    and None, rgb (3N), opacity (N). cameras: float64: c2w (C,4,4), intrinsics (C,4), time (C)."""
     xyz, t, velocity, sigma_t, shape, rotation, rgb, opacity = inputs
     c2w, intrinsics, time = cameras
     ids, count = _cull(time[c], t, sigma_t, opacity, inference)
