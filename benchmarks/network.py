@@ -18,19 +18,22 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import nn
 
+from timesplat.benchmarks.cameras import ring
+from timesplat.benchmarks.timing import least
 from timesplat.datagen.sequence import read_sequence, sequences_in
 from timesplat.evaluation.image_quality import psnr
 from timesplat.evaluation.scoring import draw
 from timesplat.model.checkpoints_io import CHECKPOINTS, load_network
+from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.inference import geometry_for
 from timesplat.model.network import PRESETS, Network
 from timesplat.model.views import Views, load_views
@@ -41,23 +44,15 @@ SMALL = 3  # how many of them the CPU does by default
 
 
 def ball(views: int, size: int) -> Views:
-    """The views of a ball from cameras in a circle, distance 2.7, 50 degrees."""
-    poses = []
-    for i in range(views):
-        a = 2 * math.pi * i / views
-        right = torch.tensor([-math.sin(a), math.cos(a), 0.0])
-        forward = torch.tensor([-math.cos(a), -math.sin(a), 0.0])
-        pose = torch.eye(4)
-        pose[:3] = torch.stack([right, torch.linalg.cross(forward, right), forward, -2.7 * forward], 1)
-        poses.append(pose)
-    f = 0.5 * size / math.tan(math.radians(25))
+    """The views of a ball from a ring of cameras; its pictures have size² pixels."""
+    c2w, intrinsics = ring(views, size)
     axis = (torch.arange(size) + 0.5) / size * 2 - 1
     alpha = (axis[:, None].hypot(axis) < 0.52).float().expand(views, -1, -1)
     return Views(
         rgb=torch.rand(views, size, size, 3),
         alpha=alpha,
-        c2w=torch.stack(poses),
-        intrinsics=torch.tensor([f, f, size / 2, size / 2]).expand(views, 4),
+        c2w=c2w,
+        intrinsics=intrinsics,
         time=torch.linspace(-1, 1, views),
         frame_step=2 / 23,
     )
@@ -73,21 +68,15 @@ def flops(network: Network, tokens: int) -> int:
     return 2 * linear + 4 * c.depth * every**2 * c.width
 
 
-def best(f, device: str, seconds: float) -> float:
-    """Least seconds of f, of at least three calls, after one to warm up."""
+def best(f: Callable[[], object], device: str, seconds: float) -> float:
+    """Least seconds of f on the wall, until the device is done."""
 
-    def timed() -> float:
-        start = time.perf_counter()
+    def done() -> None:
         f()
         if device == "cuda":
             torch.cuda.synchronize()
-        return time.perf_counter() - start
 
-    timed()
-    least, calls, end = math.inf, 0, time.perf_counter() + seconds
-    while calls < 3 or time.perf_counter() < end:
-        least, calls = min(least, timed()), calls + 1
-    return least
+    return least(done, seconds, time.perf_counter)
 
 
 def peak(device: str) -> float:
@@ -134,14 +123,12 @@ def objects(folders: list[Path]):
         yield found.parent.name, inputs, load_views(seq, seq.select(rig="target"))
 
 
-def measure(run, targets: Views) -> tuple[float, float]:
-    """Least processor seconds of three calls of run() -> Gaussians; PSNR of the held-out views."""
-    least = math.inf
-    for _ in range(3):
-        start = time.process_time()
-        g = run()
-        least = min(least, time.process_time() - start)
-    return least, float(psnr(draw(g[g.alive()], targets)[0], targets.over()).mean())
+def measure(run: Callable[[], Gaussians4D], targets: Views) -> tuple[float, float]:
+    """Least processor seconds of three calls of run(); PSNR of the held-out views."""
+    made = []
+    seconds = least(lambda: made.append(run()))
+    g = made[-1]
+    return seconds, float(psnr(draw(g[g.alive()], targets)[0], targets.over()).mean())
 
 
 @torch.inference_mode()

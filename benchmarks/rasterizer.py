@@ -22,19 +22,22 @@ import csv
 import math
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from timesplat.benchmarks import opensplat
+from timesplat.benchmarks.cameras import ring
+from timesplat.benchmarks.timing import least
 from timesplat.evaluation.provenance import machine
 from timesplat.model.gaussians import FIELDS, Gaussians4D
 from timesplat.model.io.asset import read_ply
 from timesplat.model.rasterize import render
-from timesplat.model.rasterize.simd import ROWS
+from timesplat.model.rasterize.constants import ALPHA_MIN, BLUR
+from timesplat.model.rasterize.cpu.simd import ROWS
 
-VISIBLE = 1 / 255
 NAMES = ("scene", "gaussians", "pixels", "views", "forward_ms", "both_ms", "inference_ms", "floor_ms")
 NAMES += ("times_floor", "opensplat_forward_ms", "opensplat_both_ms", "ratio", "psnr_db", "difference")
 
@@ -54,56 +57,31 @@ def cloud(n: int, seed: int = 0) -> Gaussians4D:
     )
 
 
-def ring(size: int, views: int):
-    """c2w, intrinsics, times, width, height of the default rig's distance and field of view."""
-    poses = []
-    for i in range(views):
-        a = 0.1 + 2 * math.pi * i / views
-        right = torch.tensor([-math.sin(a), math.cos(a), 0.0])
-        forward = torch.tensor([-math.cos(a), -math.sin(a), 0.0])
-        pose = torch.eye(4)
-        pose[:3] = torch.stack([right, torch.linalg.cross(forward, right), forward, -2.7 * forward], 1)
-        poses.append(pose)
-    f = 0.5 * size / math.tan(math.radians(25))
-    K = torch.tensor([f, f, size / 2, size / 2]).expand(views, 4)
-    return torch.stack(poses), K, torch.linspace(-0.8, 0.8, views), size, size
-
-
-def scene(n: int, size: int, views: int) -> tuple[list[torch.Tensor], tuple]:
-    """`cloud` as the seven leaves that `rasterize` takes, and `ring`."""
-    g = cloud(n)
-    leaves = (g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity)
-    return [x.requires_grad_() for x in leaves], ring(size, views)
+def cameras(count: int, size: int) -> tuple[Tensor, Tensor, Tensor, int, int]:
+    """What `render` takes after the scene: `ring`, times (C), width and height in pixels."""
+    return *ring(count, size), torch.linspace(-0.8, 0.8, count), size, size
 
 
 def floor(g: Gaussians4D, view) -> float:
-    """CPU-ms; the footprints' area is that of isotropic Gaussians of the same size."""
+    """CPU-ms, see above; view: of `cameras`. The footprints' area is that of isotropic Gaussians of the same size."""
     c2w, K, times = view[:3]
     pairs = steps = 0
     for i in range(len(times)):
         o = g.opacity * g.marginal(times[i])
         z = (g.position(times[i]) - c2w[i, :3, 3]) @ c2w[i, :3, 2]
-        sigma = (g.scale.square().mean(1) * (K[i, 0] / z) ** 2 + 0.3).sqrt()
-        reach = (sigma * (2 * (o / VISIBLE).clamp_min(1).log()).sqrt())[o >= VISIBLE]
+        sigma = (g.scale.square().mean(1) * (K[i, 0] / z) ** 2 + BLUR).sqrt()
+        reach = (sigma * (2 * (o / ALPHA_MIN).clamp_min(1).log()).sqrt())[o >= ALPHA_MIN]
         pairs += len(reach)
         steps += ((2 * reach / ROWS).clamp_min(1) * (math.pi / 2 * reach / 8).clamp_min(1)).sum().item()
     return 1e-6 * max(60 * pairs, 11 * pairs + 15 * steps)
 
 
-def best(f, seconds: float) -> float:
-    """Least CPU-ms of f over about `seconds`, at least three calls."""
-    f()
-    cpu = math.inf
-    end, calls = time.perf_counter() + seconds, 0
-    while calls < 3 or time.perf_counter() < end:
-        c = time.process_time()
-        f()
-        cpu = min(cpu, time.process_time() - c)
-        calls += 1
-    return 1e3 * cpu
+def best(call: Callable[[], object], seconds: float) -> float:
+    """Least CPU-ms of a call."""
+    return 1e3 * least(call, seconds)
 
 
-def timings(draw, leaves: list[torch.Tensor], seconds: float) -> list[float]:
+def timings(draw, leaves: list[Tensor], seconds: float) -> list[float]:
     """`best` of draw() -> (rgb, alpha), without gradients and with those of `leaves`."""
 
     def forward():
@@ -123,14 +101,14 @@ def timings(draw, leaves: list[torch.Tensor], seconds: float) -> list[float]:
 
 def measure(name: str, g: Gaussians4D, size: int, views: int, seconds: float, other=None) -> dict:
     """One row of the table; `other`: OpenSplat, compiled."""
-    view, leaves = ring(size, views), [getattr(g, k) for k in FIELDS]
+    view, leaves = cameras(views, size), [getattr(g, k) for k in FIELDS]
     row = {"scene": name, "gaussians": len(g), "pixels": size, "views": views, "floor_ms": floor(g, view)}
     row["forward_ms"], row["both_ms"] = timings(lambda: render(g, *view), leaves, seconds)
     row["times_floor"] = row["both_ms"] / row["floor_ms"]
     with torch.no_grad():
         row["inference_ms"] = best(lambda: render(g, *view, inference=True), seconds)
         if other:
-            theirs = opensplat.slices(g, view[2], VISIBLE)
+            theirs = opensplat.slices(g, view[2], ALPHA_MIN)
             a, b = render(g, *view)[0], opensplat.render(other, theirs, *view)[0]
             row["difference"] = float((a - b).abs().max())
             row["psnr_db"] = float(-10 * (a - b).square().mean().log10())

@@ -11,39 +11,31 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import math
 import sys
 import time
 from functools import partial
 
 import torch
 
-from timesplat.benchmarks.rasterizer import scene
-from timesplat.model.rasterize import rasterize
+from timesplat.benchmarks.rasterizer import cameras, cloud
+from timesplat.benchmarks.timing import least
+from timesplat.model.gaussians import FIELDS, Gaussians4D
+from timesplat.model.rasterize import render
 
 
-def run(g, view, backend, backward):
+def run(g: Gaussians4D, view, backend: str, backward: bool) -> list[torch.Tensor]:
     """-> [rgb, alpha], or with the gradients of mean(rgb) + mean(alpha); waits for the card."""
-    for x in g:
+    leaves = [getattr(g, k) for k in FIELDS]
+    for x in leaves:
         x.grad = None
     with torch.set_grad_enabled(backward):
-        out = rasterize(*g, *view, backend=backend)
+        out = render(g, *view, backend=backend)
     if backward:
         (out[0].mean() + out[1].mean()).backward()
-        out = [*out, *(x.grad for x in g)]
-    if g[0].is_cuda:
+        out = [*out, *(x.grad for x in leaves)]
+    if g.xyz.is_cuda:
         torch.cuda.synchronize()
     return [x.detach() for x in out]
-
-
-def best(f, seconds):
-    """Least wall-ms of f over about `seconds`, at least three calls."""
-    least, end, calls = math.inf, time.perf_counter() + seconds, 0
-    while calls < 3 or time.perf_counter() < end:
-        start = time.perf_counter()
-        f()
-        least, calls = min(least, time.perf_counter() - start), calls + 1
-    return 1e3 * least
 
 
 def main():
@@ -56,24 +48,23 @@ def main():
         print("This benchmark needs an NVIDIA GPU and a torch built for CUDA.")
         sys.exit(2)
 
-    backends = ["cpu", "triton"] + ["cuda"] * bool(importlib.util.find_spec("gsplat"))
+    backends = ["cpu", "triton"] + ["gsplat"] * bool(importlib.util.find_spec("gsplat"))
     print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {torch.get_num_threads()} threads for cpu")
     print("Gaussians  image backend | first s  fwd ms fwd+bwd ms | from cpu: image  gradients")
     for n, size in (map(int, s.split("x")) for s in args.sizes.split(",")):
         reference = None
         for backend in backends:
             device = "cpu" if backend == "cpu" else "cuda"
-            g, view = scene(n, size, args.views)
-            g = [x.detach().to(device).requires_grad_() for x in g]
-            view = [x.to(device) if isinstance(x, torch.Tensor) else x for x in view]
+            g = cloud(n).map(lambda x: x.to(device).requires_grad_())  # noqa: B023
+            view = [x.to(device) if isinstance(x, torch.Tensor) else x for x in cameras(args.views, size)]
             start = time.perf_counter()
             out = [x.cpu() for x in run(g, view, backend, True)]
             first = time.perf_counter() - start
             reference = reference or out
             image = max((a - b).abs().max().item() for a, b in zip(out[:2], reference[:2], strict=True))
             worst = max(((a - b).norm() / b.norm()).item() for a, b in zip(out[2:], reference[2:], strict=True))
-            forward = best(partial(run, g, view, backend, False), args.seconds)
-            both = best(partial(run, g, view, backend, True), args.seconds)
+            calls = (partial(run, g, view, backend, backward) for backward in (False, True))
+            forward, both = (1e3 * least(call, args.seconds, time.perf_counter) for call in calls)
             print(f"{n:9d} {size:5d}² {backend:>7} | {first:7.2f} {forward:7.2f} {both:10.2f} |", end="")
             print(f" {image:15.1e} {worst:10.1e}")
 

@@ -9,26 +9,15 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from timesplat.benchmarks.timing import least
 from timesplat.evaluation.provenance import machine
 from timesplat.model.io.asset import ARRAYS, Asset, read_ply
 from timesplat.model.io.usd_write import MODES, check_usd, read_usd, write_usd
-
-
-def least(call: Callable[[], object]) -> float:
-    """Processor seconds, the least of three calls."""
-    taken = []
-    for _ in range(3):
-        start = time.process_time()
-        call()
-        taken.append(time.process_time() - start)
-    return min(taken)
 
 
 def rows(asset: Asset) -> list[str]:

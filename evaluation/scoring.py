@@ -18,7 +18,7 @@ from ..model.io.asset import write_ply
 from ..model.methods import METHODS, ReconstructOptions
 from ..model.parallel import clock
 from ..model.rasterize import render
-from ..model.rasterize.timeline import WORTH, Timeline
+from ..model.rasterize.lifetime_index import QUICKER_FROM, LifetimeIndex
 from ..model.reconstruct import reconstruct_views
 from ..model.views import Views
 from .loading import Truth
@@ -48,8 +48,8 @@ def draw(scene: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
     """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
     paper's inference filters."""
     height, width = views.size
-    if isinstance(scene, Gaussians4D) and len(scene) > WORTH:
-        scene = Timeline(scene)
+    if isinstance(scene, Gaussians4D) and len(scene) > QUICKER_FROM:
+        scene = LifetimeIndex(scene)
     with torch.no_grad():
         return render(scene, views.c2w, views.intrinsics, views.time, width, height, inference=True)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..datagen.sequence import Sequence
 
-BACKGROUND = 1.0  # white: what pictures are composited over where nothing else is said, in each channel
+BACKGROUND = 1.0  # white: what pictures are laid on where nothing else is said
 
 
 @dataclass

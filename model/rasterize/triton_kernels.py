@@ -1,35 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The second CUDA backend: Triton kernels, for machines that have torch and a driver but no CUDA compiler.
+"""The Triton backend's kernels: cull, project, blend, and the way back (triton.py calls them in this order).
 
-The steps are the CPU backend's: cull by time, opacity and depth; sort the survivors by depth; project them in that
-order (float64, as there); list for every tile of 16² pixels the Gaussians whose box reaches it; blend each tile
-front to back (float32), groups of Gaussians against all its pixels. The backward pass walks the lists back to
-front and recovers each transmittance by division. Every (tile, Gaussian) pair owns one row of a gradient buffer,
-which is then summed in a fixed order: no atomics, the same bits on every run.
-
-Developed with Triton's interpreter (TRITON_INTERPRET=1, set before triton is imported), which runs the kernels on
-CPU tensors, and with its compiler, which needs no card; not yet run on one, nor timed.
-"""
+All take pointers to contiguous float32: xyz (N,3), t (N), velocity (N,3), sigma_t (N), cov (N,3,3), rgb (N,3),
+opacity (N), background (3,), image (C,H,W,3), alpha (C,H,W), and of each the gradient, g_…; cameras are float64."""
 
 from __future__ import annotations
 
 import math
 
-import torch
+import triton
+import triton.language as tl
 
-try:
-    import triton
-    import triton.language as tl
-except ImportError as e:
-    raise ImportError("rasterizing on CUDA without gsplat needs triton, a part of torch for CUDA on Linux") from e
-
-from . import ALPHA_MAX, ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR, T_STOP
+from . import constants
 
 LOG2E = math.log2(math.e)
 TILE, GROUP = tl.constexpr(16), tl.constexpr(8)  # pixels a side; Gaussians that a tile takes at once
-NEAREST, BLURRED, FILTERED = tl.constexpr(NEAR), tl.constexpr(BLUR), tl.constexpr(FILTER)
-LOWEST, HIGHEST, STOP = tl.constexpr(ALPHA_MIN), tl.constexpr(ALPHA_MAX), tl.constexpr(T_STOP)
-E_MIN, SCALE = tl.constexpr(math.log2(ALPHA_MIN)), tl.constexpr(0.5 * LOG2E)
+# The shared limits, as kernels can see them.
+NEAR_PLANE, BLUR = tl.constexpr(constants.NEAR_PLANE), tl.constexpr(constants.BLUR)
+ALPHA_MIN, ALPHA_MAX = tl.constexpr(constants.ALPHA_MIN), tl.constexpr(constants.ALPHA_MAX)
+TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
+INFERENCE_MIN = tl.constexpr(constants.INFERENCE_MIN)
+LOG_ALPHA_MIN, SCALE = tl.constexpr(math.log2(constants.ALPHA_MIN)), tl.constexpr(0.5 * LOG2E)
 UNSCALE, MOMENT = tl.constexpr(2 / LOG2E), tl.constexpr(2 / LOG2E**2)
 # A camera is a row of float64: c2w's upper three rows, fx fy cx cy, bounds of the slopes x0 x1 y0 y1, time.
 CAMERA = tl.constexpr(21)
@@ -74,14 +65,14 @@ def _flatten(n, camera, px, py, pz, cov):
     ms0, ks0 = m0 * xx + m1 * xy + m2 * xz, k0 * xx + k1 * xy + k2 * xz
     ms1, ks1 = m0 * xy + m1 * yy + m2 * yz, k0 * xy + k1 * yy + k2 * yz
     ms2, ks2 = m0 * xz + m1 * yz + m2 * zz, k0 * xz + k1 * yz + k2 * zz
-    sxx = ms0 * m0 + ms1 * m1 + ms2 * m2 + BLURRED
+    sxx = ms0 * m0 + ms1 * m1 + ms2 * m2 + BLUR
     sxy = ms0 * k0 + ms1 * k1 + ms2 * k2
-    syy = ks0 * k0 + ks1 * k1 + ks2 * k2 + BLURRED
+    syy = ks0 * k0 + ks1 * k1 + ks2 * k2 + BLUR
     return sx, sy, m0, m1, m2, k0, k1, k2, ms0, ms1, ms2, ks0, ks1, ks2, sxx, sxy, syy
 
 
 @triton.jit
-def _cull(xyz, t, velocity, sigma_t, opacity, cameras, depth, count, INFERENCE: tl.constexpr, BLOCK: tl.constexpr):
+def cull(xyz, t, velocity, sigma_t, opacity, cameras, depth, count, INFERENCE: tl.constexpr, BLOCK: tl.constexpr):
     """depth (C,N): of what may be seen from a view, else -1."""
     c = tl.program_id(1)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -91,9 +82,9 @@ def _cull(xyz, t, velocity, sigma_t, opacity, cameras, depth, count, INFERENCE: 
     dt /= _double(sigma_t, n)
     marginal = tl.exp(-0.5 * dt * dt)
     o = _double(opacity, n) * marginal
-    keep = (z >= NEAREST) & (o >= LOWEST)
+    keep = (z >= NEAR_PLANE) & (o >= ALPHA_MIN)
     if INFERENCE:
-        keep &= (marginal >= FILTERED) & (o >= FILTERED)
+        keep &= (marginal >= INFERENCE_MIN) & (o >= INFERENCE_MIN)
     tl.store(depth + c * count + n, tl.where(keep, z, -1.0).to(tl.float32), mask=here)
 
 
@@ -105,7 +96,7 @@ def _tiles(low, high, size):
 
 
 @triton.jit
-def _project(
+def project(
     ids, xyz, t, velocity, sigma_t, cov, rgb, opacity, cameras, P, box,
     rows, count, width, height, across, down, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -122,7 +113,7 @@ def _project(
     my = _double(camera, 13) * py / pz + _double(camera, 15)
     dt /= _double(sigma_t, n)
     log = tl.log2(_double(opacity, n)) - dt * dt * SCALE
-    q = tl.maximum(log - E_MIN, 0.0) * UNSCALE  # squared Mahalanobis distance where alpha is 1/255
+    q = tl.maximum(log - LOG_ALPHA_MIN, 0.0) * UNSCALE  # squared Mahalanobis distance where alpha is 1/255
     rx, ry = tl.sqrt(q * sxx), tl.sqrt(q * syy)
     det = sxx * syy - sxy * sxy
     seen = here & (det > 0) & (mx + rx > 0) & (mx - rx < width) & (my + ry > 0) & (my - ry < height)
@@ -167,11 +158,11 @@ def _alphas(P, row, here, x, y):
     log = tl.broadcast_to(tl.load(P + 5, mask=here, other=-200.0)[:, None], dx.shape)
     e = tl.fma(-u, u, tl.fma(-v, v, log))
     raw = tl.exp2(e)
-    return u, v, raw, tl.where(e >= E_MIN, tl.minimum(raw, HIGHEST), 0.0)
+    return u, v, raw, tl.where(e >= LOG_ALPHA_MIN, tl.minimum(raw, ALPHA_MAX), 0.0)
 
 
 @triton.jit
-def _blend(P, rows, starts, background, image, alpha, left, last, width, height, across, down):
+def blend(P, rows, starts, background, image, alpha, left, last, width, height, across, down):
     """One tile, whose list is rows[starts[tile] : starts[tile + 1]]. left: what the transmittance ends at;
     last: how much of the list was needed."""
     tile = tl.program_id(0)
@@ -183,12 +174,12 @@ def _blend(P, rows, starts, background, image, alpha, left, last, width, height,
     red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     deep = tl.zeros(x.shape, tl.int32)
     i = start
-    while (i < end) & (tl.max(through, 0) > STOP):
+    while (i < end) & (tl.max(through, 0) > TRANSMITTANCE_MIN):
         here = i + g < end
         row = tl.load(rows + i + g, mask=here, other=0)
         _, _, _, a = _alphas(P, row, here, x, y)
         after = through[None, :] * tl.cumprod(1 - a, 0)
-        drawn = after > STOP
+        drawn = after > TRANSMITTANCE_MIN
         weight = tl.where(drawn, a * after / (1 - a), 0.0)
         T = tl.minimum(T, tl.min(tl.where(drawn, after, 1.0), 0))
         through = tl.min(after, 0)
@@ -206,7 +197,7 @@ def _blend(P, rows, starts, background, image, alpha, left, last, width, height,
 
 
 @triton.jit
-def _unblend(
+def unblend(
     P, rows, places, starts, background, g_image, g_alpha, left, last, sums, width, height, across, down
 ):  # fmt: skip
     """Backward through one tile: the rows places[starts[tile] : starts[tile + 1]] of sums, as far as needed."""
@@ -236,7 +227,7 @@ def _unblend(
         shade += tl.load(P + row * ROW + 8, mask=here, other=0.0)[:, None] * g_blue[None, :]
         shade *= weight
         h = shade - a / (1 - a) * (behind[None, :] + (tl.cumsum(shade, 0, reverse=True) - shade))
-        h = tl.where(raw <= HIGHEST, h, 0.0)  # the clamp stops it
+        h = tl.where(raw <= ALPHA_MAX, h, 0.0)  # the clamp stops it
         out = sums + tl.load(places + start + i, mask=here, other=0).to(tl.int64) * ROW
         tl.store(out, tl.sum(weight * g_red[None, :], 1), mask=here)
         tl.store(out + 1, tl.sum(weight * g_green[None, :], 1), mask=here)
@@ -252,7 +243,7 @@ def _unblend(
 
 
 @triton.jit
-def _add(sums, ends, S, rows, BLOCK: tl.constexpr):
+def add_pairs(sums, ends, S, rows, BLOCK: tl.constexpr):
     """Row k of S: the sum of the rows of sums that belong to it, those before ends[k] and not before ends[k - 1]."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     first = tl.load(ends + k - 1, mask=(k > 0) & (k < rows), other=0)
@@ -266,7 +257,7 @@ def _add(sums, ends, S, rows, BLOCK: tl.constexpr):
 
 
 @triton.jit
-def _chain(
+def chain_rule(
     slots, P, S, xyz, t, velocity, sigma_t, cov, opacity, cameras,
     g_xyz, g_t, g_velocity, g_sigma, g_cov, g_rgb, g_opacity, views, count, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -349,86 +340,3 @@ def _store3(at, a, b, c, mask):
     tl.store(at, a.to(tl.float32), mask=mask)
     tl.store(at + 1, b.to(tl.float32), mask=mask)
     tl.store(at + 2, c.to(tl.float32), mask=mask)
-
-
-def _cameras(c2w, intrinsics, time, width, height, device):
-    """-> (C, CAMERA) float64."""
-    c2w, intrinsics, time = (x.detach().to(device, torch.float64) for x in (c2w, intrinsics, time))
-    f, centre = intrinsics[:, :2], intrinsics[:, 2:]
-    size = torch.tensor([width, height], dtype=torch.float64, device=device)
-    low, high = -centre / f - MARGIN * 0.5 * size / f, (size - centre) / f + MARGIN * 0.5 * size / f
-    bounds = torch.stack([low, high], -1).flatten(1)
-    return torch.cat([c2w[:, :3].flatten(1), intrinsics, bounds, time[:, None]], 1).contiguous()
-
-
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, *args):
-        ctx.save_for_backward(*args[:7])
-        xyz, t, velocity, sigma_t, covariance, rgb, opacity = (x.detach().float().contiguous() for x in args[:7])
-        (width, height), background, inference = args[10:]
-        device, count = xyz.device, len(xyz)
-        cameras, background = _cameras(*args[7:10], width, height, device), background.float().contiguous()
-        views = len(cameras)
-        across, down = -(-width // TILE.value), -(-height // TILE.value)
-
-        depth = torch.empty(views * count, device=device)
-        grid = (triton.cdiv(count, 128), views)
-        _cull[grid](xyz, t, velocity, sigma_t, opacity, cameras, depth, count, inference, 128)
-        ids = (depth >= 0).nonzero()[:, 0]
-        ids = ids[depth[ids].argsort(stable=True)].int()  # equal depths stay in the order of the input
-        P = torch.empty(len(ids), ROW.value, device=device)
-        box = torch.empty(len(ids), 3, dtype=torch.int32, device=device)
-        _project[(triton.cdiv(len(ids), 128),)](
-            ids, xyz, t, velocity, sigma_t, covariance, rgb, opacity, cameras, P, box,
-            len(ids), count, width, height, across, down, 128,
-        )  # fmt: skip
-
-        # The pairs (tile, row), first row after row, then sorted by tile, which keeps each tile's rows by depth.
-        first, wide, many = box.unbind(1)
-        ends = many.cumsum(0)
-        rows = torch.repeat_interleave(many)
-        place = torch.arange(len(rows), device=device) - (ends - many)[rows]
-        tile = first[rows] + place // wide[rows] * across + place % wide[rows]
-        tile, places = tile.int().sort(stable=True)
-        rows, places = rows[places].int(), places.int()
-        tiles = views * across * down
-        starts = torch.searchsorted(tile, torch.arange(tiles + 1, device=device), out_int32=True)
-
-        shape = (views, height, width)
-        image, alpha, left = (torch.empty(s, device=device) for s in ((*shape, 3), shape, shape))
-        last = torch.empty(shape, dtype=torch.int32, device=device)
-        _blend[(tiles,)](P, rows, starts, background, image, alpha, left, last, width, height, across, down)
-        ctx.saved = cameras, background, ids, P, ends, rows, places, starts, left, last
-        return image.to(args[0].dtype), alpha.to(args[0].dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        inputs = [x.detach().float().contiguous() for x in ctx.saved_tensors]
-        xyz, t, velocity, sigma_t, covariance, _, opacity = inputs
-        g_image, g_alpha = (g.float().contiguous() for g in grads)
-        cameras, background, ids, P, ends, rows, places, starts, left, last = ctx.saved
-        views, height, width = left.shape
-        sums, S = torch.zeros(len(rows), ROW.value, device=xyz.device), torch.empty_like(P)
-        _unblend[(len(starts) - 1,)](
-            P, rows, places, starts, background, g_image, g_alpha, left, last, sums,
-            width, height, -(-width // TILE.value), -(-height // TILE.value),
-        )  # fmt: skip
-        _add[(triton.cdiv(len(ids), 8),)](sums, ends, S, len(ids), 8, num_warps=1)
-        slots = torch.full((views * len(xyz),), -1, dtype=torch.int32, device=xyz.device)
-        slots[ids.long()] = torch.arange(len(ids), dtype=torch.int32, device=xyz.device)
-        out = [torch.empty_like(x) for x in inputs]
-        _chain[(triton.cdiv(len(xyz), 128),)](
-            slots, P, S, xyz, t, velocity, sigma_t, covariance, opacity, cameras, *out, views, len(xyz), 128
-        )
-        return *(x.to(y.dtype) for x, y in zip(out, ctx.saved_tensors, strict=True)), *([None] * 6)
-
-
-def rasterize(*args):
-    """See `timesplat.model.rasterize.rasterize`; after the cameras: (width, height), background (3,), inference.
-    ValueError for tensors that are not on a CUDA device."""
-    if not args[0].is_cuda and isinstance(_blend, triton.JITFunction):  # and not interpreted
-        raise ValueError('rasterize: backend "triton" needs tensors on a CUDA device')
-    with torch.cuda.device_of(args[0]):
-        return _Rasterize.apply(*args)

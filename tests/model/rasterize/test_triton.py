@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Triton backend against the slow float64 reference, on the scenes and with the measures of test_rasterize.py.
+"""The Triton backend against the slow float64 reference.
 
 On a machine with CUDA the kernels run compiled. Elsewhere one test runs this file once more with Triton's
 interpreter, which has to be asked for before triton is imported, and another compiles the kernels for a card that
@@ -8,18 +8,16 @@ is not there."""
 import os
 import subprocess
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
 
-triton = pytest.importorskip("triton", reason="needs triton")
+from timesplat.model.rasterize import render
 
-spec = spec_from_file_location("test_rasterize", Path(__file__).with_name("test_rasterize.py"))
-scenes = module_from_spec(spec)
-spec.loader.exec_module(scenes)
-one_thread, rasterize, NAMES = scenes.one_thread, scenes.rasterize, scenes.NAMES
+from .scenes import assert_equals_reference, cameras, cloud, scenes, with_gradients
+
+triton = pytest.importorskip("triton", reason="needs triton")
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 DEVICE = "cpu" if INTERPRETED else "cuda"
@@ -42,12 +40,12 @@ def test_under_the_interpreter():
 @pytest.mark.parametrize(
     "name, types, constants",
     [
-        ("_cull", "FFFFFDFi", {"INFERENCE": True, "BLOCK": 128}),
-        ("_project", "IFFFFFFFDFIiiiiii", {"BLOCK": 128}),
-        ("_blend", "FIIFFFFIiiii", {}),
-        ("_unblend", "FIIIFFFFIFiiii", {}),
-        ("_add", "FLFi", {"BLOCK": 8}),
-        ("_chain", "IFFFFFFFFDFFFFFFFii", {"BLOCK": 128}),
+        ("cull", "FFFFFDFi", {"INFERENCE": True, "BLOCK": 128}),
+        ("project", "IFFFFFFFDFIiiiiii", {"BLOCK": 128}),
+        ("blend", "FIIFFFFIiiii", {}),
+        ("unblend", "FIIIFFFFIFiiii", {}),
+        ("add_pairs", "FLFi", {"BLOCK": 8}),
+        ("chain_rule", "IFFFFFFFFDFFFFFFFii", {"BLOCK": 128}),
     ],
 )
 def test_compiles_without_a_card(name, types, constants, tmp_path, monkeypatch):
@@ -65,37 +63,17 @@ def test_compiles_without_a_card(name, types, constants, tmp_path, monkeypatch):
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"]
 
 
-def with_gradients(g, view, **kw):
-    """As scenes.with_gradients, on the device."""
-    g = {k: v.detach().to(DEVICE).requires_grad_() for k, v in g.items()}
-    rgb, alpha = rasterize(*g.values(), *view, backend="triton", **kw)
-    rng = torch.Generator().manual_seed(7)
-    a, b = torch.randn(rgb.shape, generator=rng), torch.randn(alpha.shape, generator=rng)
-    ((rgb * a.to(DEVICE)).sum() + (alpha * b.to(DEVICE)).sum()).backward()
-    return rgb.detach().cpu(), alpha.detach().cpu(), [v.grad.cpu() for v in g.values()]
-
-
-def compare(g, view, **kw):
-    """Asserts that image, alpha and the seven gradients equal the reference's; returns the reference's."""
-    got, want = with_gradients(g, view, **kw), scenes.with_gradients(g, view, "reference", torch.float64, **kw)
-    for a, b in zip(got[:2], want[:2], strict=True):
-        assert a.shape == b.shape
-        error = (a - b).abs().flatten() / max(1, b.abs().max())
-        assert error.sort().values[: max(1, int(0.999 * len(error)))].max() < 1e-5
-        assert error.max() < 2e-2
-    for name, a, b in zip(NAMES, got[2], want[2], strict=True):
-        assert a.isfinite().all(), name
-        assert (a - b).norm() <= CLOSE * b.norm() + 1e-9, (name, ((a - b).norm() / b.norm()).item())
-    return want
+def compare(g, view, **options):
+    return assert_equals_reference(g, view, "triton", DEVICE, pixels=1e-5, gradients=CLOSE, **options)
 
 
 def affordable():
     """All scenes; under the slow interpreter fewer, of fewer Gaussians."""
-    for name, g, view in scenes.scenes():
+    for name, g, view in scenes():
         if INTERPRETED and name in ("tiles", "tiny", "huge", "brief", "fast"):
             continue
         if INTERPRETED and name != "opaque stack":  # whose pixels must stop
-            g = {k: v[::4] for k, v in g.items()}
+            g = g[::4]
         yield pytest.param(g, view, id=name)
 
 
@@ -107,57 +85,55 @@ def test_equals_reference(g, view):
 
 @runs
 def test_a_view_without_gaussians():
-    c2w, K, times, width, height = scenes.cameras(3, 20, 37)
-    g = scenes.cloud(20, sigma_t=(0.01, 0.02))
-    g["t"] = times[[0, 2]].repeat(10)
-    _, alpha, _ = compare(g, (c2w, K, times, width, height))
+    view = cameras(3, 20, 37)
+    g = replace(cloud(20, sigma_t=(0.01, 0.02)), t=view[2][[0, 2]].repeat(10))
+    _, alpha, _ = compare(g, view)
     assert (alpha.amax((1, 2)) > 0).tolist() == [True, False, True]
 
 
 @runs
 def test_inference_filters():
-    g, view = scenes.cloud(50), scenes.cameras(2, 20, 20)
-    want = rasterize(*g.values(), *view, inference=True, backend="reference")
-    got = rasterize(*(x.to(DEVICE) for x in g.values()), *view, inference=True, backend="triton")
+    g, view = cloud(50), cameras(2, 20, 20)
+    want = render(g, *view, inference=True, backend="reference")
+    got = render(g.to(DEVICE), *view, inference=True, backend="triton")
     for a, b in zip(got, want, strict=True):
         torch.testing.assert_close(a.cpu(), b, rtol=0, atol=1e-5)
-    assert (want[1] - rasterize(*g.values(), *view, backend="reference")[1]).abs().max() > 1e-3
+    assert (want[1] - render(g, *view, backend="reference")[1]).abs().max() > 1e-3
 
 
 @runs
 def test_same_bits_on_every_run():
-    g, view = scenes.cloud(20, scale=(0.02, 0.1)), scenes.cameras(2, 20, 14)
-    one, two = with_gradients(g, view), with_gradients(g, view)
+    g, view = cloud(20, scale=(0.02, 0.1)), cameras(2, 20, 14)
+    one, two = (with_gradients(g, view, "triton", device=DEVICE) for _ in range(2))
     assert torch.equal(one[0], two[0]) and torch.equal(one[1], two[1])
-    assert all(torch.equal(a, b) for a, b in zip(one[2], two[2], strict=True))
+    assert all(torch.equal(x, two[2][k]) for k, x in one[2].items())
 
 
 @runs
 def test_no_views_and_dtype_is_kept():
-    g, (c2w, K, times, width, height) = scenes.cloud(10), scenes.cameras(1, 8, 9)
-    g = {k: v.to(DEVICE, torch.float64) for k, v in g.items()}
-    assert rasterize(*g.values(), c2w, K, times, width, height, backend="triton")[0].dtype == torch.float64
-    rgb, alpha = rasterize(*g.values(), c2w[:0], K[:0], times[:0], width, height, backend="triton")
+    g, (c2w, K, times, width, height) = cloud(10).to(DEVICE, torch.float64), cameras(1, 8, 9)
+    assert render(g, c2w, K, times, width, height, backend="triton")[0].dtype == torch.float64
+    rgb, alpha = render(g, c2w[:0], K[:0], times[:0], width, height, backend="triton")
     assert rgb.shape == (0, height, width, 3) and alpha.shape == (0, height, width)
 
 
 @pytest.mark.skipif(INTERPRETED, reason="the interpreter takes CPU tensors")
 def test_tensors_must_be_on_a_card():
     with pytest.raises(ValueError, match="CUDA device"):
-        rasterize(*scenes.cloud(3).values(), *scenes.cameras(), backend="triton")
+        render(cloud(3), *cameras(), backend="triton")
 
 
 def test_missing_triton_is_named(monkeypatch):
-    monkeypatch.delitem(sys.modules, "timesplat.model.rasterize.triton_kernels", raising=False)
+    monkeypatch.delitem(sys.modules, "timesplat.model.rasterize.triton", raising=False)
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(ImportError, match="needs triton"):
-        rasterize(*scenes.cloud(3).values(), *scenes.cameras(), backend="triton")
+        render(cloud(3), *cameras(), backend="triton")
 
 
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
 def test_stands_in_for_gsplat(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    g, view = {k: v.cuda() for k, v in scenes.cloud(50).items()}, scenes.cameras()
-    for a, b in zip(rasterize(*g.values(), *view), rasterize(*g.values(), *view, backend="triton"), strict=True):
+    g, view = cloud(50).to("cuda"), cameras()
+    for a, b in zip(render(g, *view), render(g, *view, backend="triton"), strict=True):
         assert torch.equal(a, b)

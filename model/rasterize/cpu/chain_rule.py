@@ -3,20 +3,19 @@
 back to the inputs, eight Gaussians at a time, in float64, after projecting them once more (see `project.py`).
 """
 
-# ruff: noqa: I001 (one line of constants, not sixteen)
 from __future__ import annotations
 
 import math
 
 import numpy as np
 
-from .project import (
-    F32, H, HU, HUU, HUV, HV, HVV, LOG2E, SUMS, _axes, _camera, _covariance, _dot, _mean, _project, serial,
-)  # fmt: skip
+from .jit import jit
+from .layout import HU, HUU, HUV, HV, HVV, LOG2E, SUMS, H, float32
+from .project import axes_of, camera_of, covariance_of, dot, mean_of, project
 from .simd import gather, load_doubles, select, splat, sqrt, store
 
 
-@serial
+@jit
 def _turn(q, g):
     """The gradient of the quaternion q = (w, x, y, z) by that of its rotation's rows, g."""
     w, x, y, z = q
@@ -30,14 +29,14 @@ def _turn(q, g):
     )
 
 
-@serial
+@jit
 def _add(out, lanes, k, ids, size, part, count):
     """out[ids[lane], part] += lanes[k, lane], out having rows of `size`."""
     for lane in range(count):
         out[ids[lane] * size + part] += lanes[k * 8 + lane]
 
 
-@serial
+@jit
 def _store_shape(lanes, shape, rotation, ids, a, b, m, k):
     """The gradient of Σ_3, aᵀ m + bᵀ k, to rows 9 on of lanes; or of scale to 9 on, of the quaternion to 12 on."""
     if rotation is None:
@@ -46,7 +45,7 @@ def _store_shape(lanes, shape, rotation, ids, a, b, m, k):
                 store(lanes, (9 + 3 * i + j) * 8, a[i] * m[j] + b[i] * k[j])
     else:
         # Σ = A Aᵀ with A = R S, so dL/dA = 2 (dL/dΣ) R S =: 2 G S; dL/ds is the sum down a column of 2 G R S.
-        q, s, R = _axes(shape, rotation, ids, 0)
+        q, s, R = axes_of(shape, rotation, ids, 0)
         two = splat(2.0)
         mR, kR = _row_times(m, R), _row_times(k, R)
         G = (_outer_row(a[0], mR, b[0], kR), _outer_row(a[1], mR, b[1], kR), _outer_row(a[2], mR, b[2], kR))
@@ -58,7 +57,7 @@ def _store_shape(lanes, shape, rotation, ids, a, b, m, k):
             store(lanes, (12 + i) * 8, g[i])
 
 
-@serial
+@jit
 def _row_times(m, R):
     return (
         m[0] * R[0][0] + m[1] * R[1][0] + m[2] * R[2][0],
@@ -67,17 +66,17 @@ def _row_times(m, R):
     )
 
 
-@serial
+@jit
 def _outer_row(a, m, b, k):
     return a * m[0] + b * k[0], a * m[1] + b * k[1], a * m[2] + b * k[2]
 
 
-@serial
+@jit
 def _scaled(a, v):
     return a[0] * v[0], a[1] * v[1], a[2] * v[2]
 
 
-@serial
+@jit
 def _add_shape(g_shape, g_rotation, lanes, ids, count):
     if g_rotation is None:
         for i in range(9):
@@ -89,14 +88,14 @@ def _add_shape(g_shape, g_rotation, lanes, ids, count):
             _add(g_rotation, lanes, 12 + i, ids, 4, i, count)
 
 
-@serial
-def chain(c, own, ids, first, sums, inputs, cameras, width, height, out):
-    """Adds to the gradients `out` of the inputs what the gradients `sums` of view c's pairs say of the
-    Gaussians own[0] <= n < own[1]."""
+@jit
+def chain_rule(c, own, ids, first, sums, inputs, cameras, width, height, out):
+    """Adds to the gradients `out` of the inputs, flat as they are, what the gradients `sums` (pairs, SUMS) of view c
+    say of the Gaussians own[0] <= n < own[1]. ids, first, inputs, cameras: as `project_view` takes and gives them."""
     xyz, t, velocity, sigma_t, shape, rotation, _, opacity = inputs
     g_xyz, g_t, g_velocity, g_sigma, g_shape, g_rotation, g_rgb, g_opacity = out
     c2w, intrinsics, time = cameras
-    camera = _camera(c, c2w, intrinsics, width, height)
+    camera = camera_of(c, c2w, intrinsics, width, height)
     ax, ay, az, _, (fx, fy, _, _), _ = camera
     now, one, zero, two = splat(time[c]), splat(1.0), splat(0.0), splat(2.0)
     f, scale = splat(2 / LOG2E), splat(math.sqrt(0.5 * LOG2E))
@@ -108,7 +107,7 @@ def chain(c, own, ids, first, sums, inputs, cameras, width, height, out):
         while count < 8 and r < last:
             seen = False
             for k in range(SUMS):
-                s = F32(0)
+                s = float32(0)
                 for slot in range(first[r], first[r + 1]):
                     s += sums[slot, k]
                 S[k * 8 + count] = s
@@ -119,8 +118,8 @@ def chain(c, own, ids, first, sums, inputs, cameras, width, height, out):
         if count == 0:
             break
         here[count:] = here[0]
-        dt, mean = _mean(here, 0, now, xyz, t, velocity)
-        p, (sx, sy), (m, k), (ms, ks), (sxx, sxy, syy) = _project(camera, mean, _covariance(shape, rotation, here, 0))
+        dt, mean = mean_of(here, 0, now, xyz, t, velocity)
+        p, (sx, sy), (m, k), (ms, ks), (sxx, sxy, syy) = project(camera, mean, covariance_of(shape, rotation, here, 0))
         ux = scale * sqrt(syy / (sxx * syy - sxy * sxy))
         uy, vy = -ux * sxy / syy, scale / sqrt(syy)
         h, hu, hv = load_doubles(S, H * 8), load_doubles(S, HU * 8), load_doubles(S, HV * 8)
@@ -137,7 +136,7 @@ def chain(c, own, ids, first, sums, inputs, cameras, width, height, out):
         _store_shape(lanes, shape, rotation, here, a, b, m, k)
         a = (two * (gxx * ms[0] + gxy * ks[0]), two * (gxx * ms[1] + gxy * ks[1]), two * (gxx * ms[2] + gxy * ks[2]))
         b = (two * (gxy * ms[0] + gyy * ks[0]), two * (gxy * ms[1] + gyy * ks[1]), two * (gxy * ms[2] + gyy * ks[2]))
-        j00, j02, j11, j12 = _dot(a, ax), _dot(a, az), _dot(b, ay), _dot(b, az)
+        j00, j02, j11, j12 = dot(a, ax), dot(a, az), dot(b, ay), dot(b, az)
         rz = one / p[2]
         jx, jy = fx * rz, fy * rz
         gx, gy = jx * gmx, jy * gmy

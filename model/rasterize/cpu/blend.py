@@ -1,28 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU backend: compiled by numba, parallel over views and tiles, a block of 8 or 16 pixels at a time.
+"""The CPU backend's per-pixel half: blends tiles front to back, and walks them back to front for the gradients.
 
-Per view: cull by time, opacity and depth; project the survivors; sort them by depth; bin them into tiles (exactly: a
-tile is entered only where the ellipse reaches it, Speedy-Splat's AccuTile); blend every tile front to back. Within a
-tile a Gaussian visits just the rows, and on each row just the span of pixels, where its alpha reaches 1/255. The
-backward pass walks the tile lists back to front and recovers each transmittance by division. Every (tile, Gaussian)
-pair owns one row of a gradient buffer, and they are summed in a fixed order: no atomics, and the same bits on every
-run and for any number of threads.
+Within a tile a Gaussian visits just the rows, and on each row just the span of pixels, where its alpha reaches 1/255.
+The way back recovers each transmittance by division.
 """
 
-# ruff: noqa: I001 (one line of constants, not twenty)
+# ruff: noqa: I001 (few lines of constants, not twenty)
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
-import torch
 
-from ..parallel import each
-from . import ALPHA_MAX, T_STOP, project
-from .chain import chain
-from .project import (
-    BLUE, E_MIN, F32, GREEN, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE, UX, UY, VY, serial,
+from ..constants import ALPHA_MAX, TRANSMITTANCE_MIN
+from .jit import jit
+from .layout import (
+    BLUE, GREEN, INVERSE, LOG, LOG_ALPHA_MIN, MX, MY, REACH_X, REACH_Y, RED, SLOPE, SUMS, TILE, UX, UY, VY, float32,
 )  # fmt: skip
 from .simd import ROWS, bits, columns, exp2, fma, load, prefetch, rows, select, splat, store, store_totals, total
 
@@ -30,42 +23,42 @@ CELL, ACROSS = 8, TILE // 8  # a tile is ACROSS² cells of CELL² pixels, so tha
 # A tile's state is planes of blocks of ROWS rows of pixels, whose rows take turns: see `_at`. A span may run up to
 # seven pixels over the tile's right edge, into scratch.
 PLANE = (TILE + 8) * ROWS
-HALF, SLACK = F32(0.5), F32(1e-3)  # slack: rounding of a span's ends; the pixels decide exactly
-HIGHEST, STOP, ZERO = F32(ALPHA_MAX), F32(T_STOP), F32(0)
+HALF, SLACK = float32(0.5), float32(1e-3)  # slack: rounding of a span's ends; the pixels decide exactly
+HIGHEST, STOP, ZERO = float32(ALPHA_MAX), float32(TRANSMITTANCE_MIN), float32(0)
 WIDE = 32  # from this width on (pixels, less one) each row finds its own span; at 8 it took a half longer than it saved
 AHEAD = 8  # Gaussians: how far ahead memory is asked for
 
 
-@serial
+@jit
 def _at(planes, x, y):
     """Where a state of so many planes has the pixel (x, y) of the tile in its first plane."""
     return y // ROWS * planes * PLANE + x * ROWS + y % ROWS
 
 
-@serial
+@jit
 def _inside(centre, half, x0, n):
     """The pixels [a, b] of [x0, x0 + n) whose centres lie within `half` of `centre`; b may be one too many at the
     left edge. (No ceil or floor: they are library calls.)"""
-    low, high = max(centre - half - HALF, F32(x0)), min(centre + half - HALF, F32(x0 + n - 1))
+    low, high = max(centre - half - HALF, float32(x0)), min(centre + half - HALF, float32(x0 + n - 1))
     a = int(low)
-    return a + (F32(a) < low), (int(high) if high >= 0 else -1)
+    return a + (float32(a) < low), (int(high) if high >= 0 else -1)
 
 
-@serial
+@jit
 def _span(mx, my, slope, vy, log, inverse, y, last, x0, w):
     """The pixels [a, b] of [x0, x0 + w) that the block of rows from y on needs, the last one at most."""
     a, b = x0 + w, -1
     for k in range(ROWS):
-        dy = F32(min(y + k, last)) + HALF - my
+        dy = float32(min(y + k, last)) + HALF - my
         v = vy * dy
-        left = log - v * v - E_MIN
+        left = log - v * v - LOG_ALPHA_MIN
         low, high = _inside(mx - slope * dy, math.sqrt(max(left, ZERO)) * inverse + SLACK, x0, w)
         if left > -SLACK and low <= high:
             a, b = min(a, low), max(b, high)
     return a, b
 
 
-@serial
+@jit
 def _refresh(state, live):
     """Marks the cells where every pixel has stopped; how many have not."""
     count = 0
@@ -79,7 +72,7 @@ def _refresh(state, live):
     return count
 
 
-@serial
+@jit
 def _reaches(cells, least, a, b, top, bottom):
     """Whether any cell under the box of pixels (relative to the tile) has at least the value `least`."""
     for y in range(top // CELL, bottom // CELL + 1):
@@ -89,7 +82,7 @@ def _reaches(cells, least, a, b, top, bottom):
     return False
 
 
-@serial
+@jit
 def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
     """Blends one tile into state, planes T r g b index by block of rows. T < 0: stopped with |T| left."""
     state[:] = 0
@@ -98,7 +91,7 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
         at = _at(5, 0, y)
         for x in range(w):
             state[at + x * ROWS] = 1
-    zero, lowest, highest, stop = splat(F32(0)), splat(E_MIN), splat(HIGHEST), splat(STOP)
+    zero, lowest, highest, stop = splat(float32(0)), splat(LOG_ALPHA_MIN), splat(HIGHEST), splat(STOP)
     for i in range(first, last):
         if (i - first) % 64 == 0 and _refresh(state, live) == 0:
             break
@@ -112,12 +105,12 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
             continue
         wide = b - a >= WIDE
         red, green, blue, log = splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE]), splat(P[r, LOG])
-        index = splat(F32(i - first + 1))
+        index = splat(float32(i - first + 1))
         u0, v0 = fma(splat(ux), columns(), splat(uy) * rows()), splat(vy) * rows()
         for y in range(top - top % ROWS, bottom + 1, ROWS):
             if wide:
                 a, b = _span(mx, my, P[r, SLOPE], vy, P[r, LOG], P[r, INVERSE], y, y0 + h - 1, x0, w)
-            dy = F32(y) + HALF - my
+            dy = float32(y) + HALF - my
             v = v0 + splat(vy * dy)
             k = fma(-v, v, log)
             row = _at(5, -x0, y - y0)
@@ -127,7 +120,7 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
                 alive = zero < T
                 if bits(alive) == 0:
                     continue
-                u = u0 + splat(ux * (F32(x) + HALF - mx) + uy * dy)
+                u = u0 + splat(ux * (float32(x) + HALF - mx) + uy * dy)
                 e = fma(-u, u, k)
                 alpha = exp2(e)
                 alpha = select(alpha > highest, highest, alpha)
@@ -147,12 +140,12 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
                 store(state, at, select(go, index, load(state, at)))
 
 
-@serial
+@jit
 def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
     """Backward through one tile: state has planes T, B (the colour behind, dotted with the gradient, over its
     own transmittance), dL/dr, dL/dg, dL/db, index; deep: the highest index per cell. Writes the pairs' rows of
     sums, those of hidden pairs excepted."""
-    zero, one, lowest, highest = splat(F32(0)), splat(F32(1)), splat(E_MIN), splat(HIGHEST)
+    zero, one, lowest, highest = splat(float32(0)), splat(float32(1)), splat(LOG_ALPHA_MIN), splat(HIGHEST)
     flat = sums.reshape(-1)
     for i in range(last - 1, first - 1, -1):
         if i - AHEAD >= first:
@@ -166,14 +159,14 @@ def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
             continue
         wide = b - a >= WIDE
         red, green, blue, log = splat(P[r, RED]), splat(P[r, GREEN]), splat(P[r, BLUE]), splat(P[r, LOG])
-        index = splat(F32(i - first + 1))
+        index = splat(float32(i - first + 1))
         u0, v0 = fma(splat(ux), columns(), splat(uy) * rows()), splat(vy) * rows()
         s_red, s_green, s_blue, s_h, s_hu, s_hv = zero, zero, zero, zero, zero, zero
         s_huu, s_huv, s_hvv = zero, zero, zero
         for y in range(top - top % ROWS, bottom + 1, ROWS):
             if wide:
                 a, b = _span(mx, my, P[r, SLOPE], vy, P[r, LOG], P[r, INVERSE], y, y0 + h - 1, x0, w)
-            dy = F32(y) + HALF - my
+            dy = float32(y) + HALF - my
             v = v0 + splat(vy * dy)
             k = fma(-v, v, log)
             row = _at(6, -x0, y - y0)
@@ -182,7 +175,7 @@ def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
                 seen = load(state, at + 5 * PLANE) >= index
                 if bits(seen) == 0:
                     continue
-                u = u0 + splat(ux * (F32(x) + HALF - mx) + uy * dy)
+                u = u0 + splat(ux * (float32(x) + HALF - mx) + uy * dy)
                 e = fma(-u, u, k)
                 raw = exp2(e)
                 alpha = select((e >= lowest) & seen, select(raw > highest, highest, raw), zero)
@@ -204,10 +197,11 @@ def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
         flat[at + 8] = total(s_hvv)
 
 
-@serial
-def _blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
-    """Renders the tiles of one view; kept: per tile, the planes of what the transmittance ends at and of the last
-    one drawn, from 1."""
+@jit
+def blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
+    """Renders the tiles tiles[0] <= j < tiles[1] of one view, whose P, starts and pairs are those of `project_view`,
+    over background (3,) into image (H,W,3) and alpha (H,W). kept (tiles, TILE // ROWS, 2, PLANE): per tile, the planes
+    of what the transmittance ends at and of the last one drawn, from 1."""
     height, width = alpha.shape
     across = (width + TILE - 1) // TILE
     state, live = np.empty(TILE // ROWS * 5 * PLANE, np.float32), np.empty(ACROSS * ACROSS, np.uint8)
@@ -220,7 +214,7 @@ def _blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
             at = _at(5, 0, y)
             for x in range(w):
                 T = abs(state[at])
-                alpha[y0 + y, x0 + x] = F32(1) - T
+                alpha[y0 + y, x0 + x] = float32(1) - T
                 image[y0 + y, x0 + x, 0] = state[at + PLANE] + T * red
                 image[y0 + y, x0 + x, 1] = state[at + 2 * PLANE] + T * green
                 image[y0 + y, x0 + x, 2] = state[at + 3 * PLANE] + T * blue
@@ -231,9 +225,10 @@ def _blend_tiles(tiles, P, starts, pairs, background, image, alpha, kept):
                 kept[j, y, 1, x] = state[(y * 5 + 4) * PLANE + x]
 
 
-@serial
-def _unblend_tiles(tiles, P, starts, pairs, slots, background, g_image, g_alpha, kept, sums):
-    """Backward through the tiles of one view."""
+@jit
+def unblend_tiles(tiles, P, starts, pairs, slots, background, g_image, g_alpha, kept, sums):
+    """Backward through the tiles of one view: from g_image (H,W,3), g_alpha (H,W) and what `blend_tiles` kept to the
+    rows of sums (pairs, SUMS)."""
     height, width = g_alpha.shape
     across = (width + TILE - 1) // TILE
     state, deep = np.zeros(TILE // ROWS * 6 * PLANE, np.float32), np.empty(ACROSS * ACROSS, np.float32)
@@ -259,77 +254,3 @@ def _unblend_tiles(tiles, P, starts, pairs, slots, background, g_image, g_alpha,
                 at += ROWS
         used = starts[j] + int(deep.max())
         _unblend(P, pairs, slots, starts[j], used, x0, y0, w, h, state, deep, sums)
-
-
-def _bands(width, height):
-    """Jobs within a view: rows of tiles, as (first, last) tile."""
-    across, down = -(-width // TILE), -(-height // TILE)
-    return [(k * across, k * across + across) for k in range(down)]
-
-
-def _array(x, dtype=torch.float32):
-    """A contiguous array of a CPU tensor; its own memory where that will do."""
-    x = x.detach()
-    return (x if x.dtype == dtype and x.is_contiguous() else x.to(dtype).contiguous()).numpy()
-
-
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, inputs, cameras, size, background, inference, *tensors):
-        ctx.save_for_backward(*tensors)  # so that torch notices if they are changed in place before backward
-        (width, height), views = size, len(cameras[0])
-        tiles = -(-width // TILE) * -(-height // TILE)
-        image, alpha = np.empty((views, height, width, 3), np.float32), np.empty((views, height, width), np.float32)
-        kept = np.empty((views, tiles, TILE // ROWS, 2, PLANE), np.float32)
-        drawn = each(
-            [(c,) for c in range(views)],
-            lambda c: project.project_view(c, inputs, cameras, width, height, inference),
-        )  # per view: ids, P, starts, pairs, slots, first
-
-        def blend(c, band):
-            _, P, starts, pairs, _, _ = drawn[c]
-            _blend_tiles(band, P, starts, pairs, background, image[c], alpha[c], kept[c])
-
-        each(itertools.product(range(views), _bands(width, height)), blend)
-        ctx.saved = inputs, cameras, size, background, drawn, kept
-        dtype = tensors[0].dtype
-        return torch.from_numpy(image).to(dtype), torch.from_numpy(alpha).to(dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, g_image, g_alpha):
-        tensors, (inputs, cameras, (width, height), background, drawn, kept) = ctx.saved_tensors, ctx.saved
-        g_image, g_alpha, views = _array(g_image), _array(g_alpha), len(drawn)
-        sums = [np.zeros((len(pairs), SUMS), np.float32) for _, _, _, pairs, _, _ in drawn]
-
-        def unblend(c, band):
-            _, P, starts, pairs, slots, _ = drawn[c]
-            _unblend_tiles(band, P, starts, pairs, slots, background, g_image[c], g_alpha[c], kept[c], sums[c])
-
-        each(itertools.product(range(views), _bands(width, height)), unblend)
-        out = tuple(None if x is None else np.zeros(x.shape, np.float32) for x in inputs)
-        count, parts = len(inputs[1]), torch.get_num_threads()
-
-        def chain_part(part):  # every Gaussian has one owner, who adds the views in their order
-            own = part * count // parts, (part + 1) * count // parts
-            for c, (ids, _, _, _, _, first) in enumerate(drawn):
-                chain(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
-
-        each([(k,) for k in range(parts)], chain_part)
-        out = (x for x in out if x is not None)
-        grads = [torch.from_numpy(x.reshape(y.shape)) for x, y in zip(out, tensors, strict=True)]
-        return *[None] * 5, *(g if g.dtype == x.dtype else g.to(x.dtype) for g, x in zip(grads, tensors, strict=True))
-
-
-def rasterize(*args):
-    """See `timesplat.model.rasterize.rasterize`: xyz, t, velocity, sigma_t, covariance (or scale (N,3) and quaternion
-    (N,4)), rgb, opacity; c2w, intrinsics, time; then (width, height), background (3,), inference.
-    None where an input is not finite in float32."""
-    *tensors, c2w, intrinsics, time, size, background, inference = args
-    inputs = tuple(_array(x).reshape(-1) for x in tensors)
-    cameras = tuple(_array(x, torch.float64) for x in (c2w, intrinsics, time))
-    if not (project.all_finite(inputs) and all(np.isfinite(x).all() for x in cameras)):
-        return None
-    if len(inputs) == 7:
-        inputs = (*inputs[:5], None, *inputs[5:])  # no quaternions
-    return _Rasterize.apply(inputs, cameras, size, _array(background), inference, *tensors)

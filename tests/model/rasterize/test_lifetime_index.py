@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
 from timesplat.model.rasterize import render
-from timesplat.model.rasterize.timeline import Timeline
+from timesplat.model.rasterize.lifetime_index import LifetimeIndex
 
 
 def cloud(n: int, seed: int) -> Gaussians4D:
@@ -27,20 +27,21 @@ def cloud(n: int, seed: int) -> Gaussians4D:
 @given(st.integers(0, 2**31), st.floats(-1, 1, width=32), st.sampled_from([1, 7, 64]))
 def test_whoever_is_drawn_is_in_the_list(seed, t, bins):
     g = cloud(300, seed)
-    line = Timeline(g, bins)
+    index = LifetimeIndex(g, bins)
     p = g.marginal(torch.tensor(t))
     drawn = ((p >= 0.05) & (g.opacity * p >= 0.05)).nonzero()[:, 0]
-    assert set(drawn.tolist()) <= set(line.alive(t).tolist())
-    assert (line.alive(t).diff() > 0).all() and len(line) == 300
+    assert set(drawn.tolist()) <= set(index.candidates(t).tolist())
+    assert (index.candidates(t).diff() > 0).all() and len(index) == 300
 
 
 def test_short_lives_are_in_few_lists_and_pictures_are_the_same(spheres):
     views = spheres(list(range(0, 24, 2)), size=48)
     g = lift(views)
-    line = Timeline(g)
-    alive = torch.tensor([len(line.alive(float(t))) / len(g) for t in views.time])
+    index = LifetimeIndex(g)
+    alive = torch.tensor([len(index.candidates(float(t))) / len(g) for t in views.time])
     assert alive.max() < 0.6 and alive.min() > 0.01
     cameras = views.c2w, views.intrinsics, views.time, 48, 48
-    for one, same in zip(*(render(scene, *cameras, inference=True) for scene in (line, g)), strict=True):
+    for one, same in zip(*(render(scene, *cameras, inference=True) for scene in (index, g)), strict=True):
         torch.testing.assert_close(one, same, rtol=0, atol=1e-4)
-    assert torch.equal(line.alive(-7.0), line.alive(-1.0)) and torch.equal(line.alive(7.0), line.alive(1.0))
+    for beyond, end in ((-7.0, -1.0), (7.0, 1.0)):
+        assert torch.equal(index.candidates(beyond), index.candidates(end))

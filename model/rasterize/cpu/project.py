@@ -1,50 +1,31 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU backend's per-Gaussian half: cull, project, sort, bin. `chain.py` is its way back.
+"""The CPU backend's per-Gaussian half: cull and project; `chain_rule.py` is its way back.
 
 Eight Gaussians at a time, in the order of the input, so that memory is read from one end to the other; in float64,
 because near cameras and thin Gaussians need the digits. Loops live inside the functions that take arrays: numba counts
 references on every call, which two threads would fight over.
 """
 
+# ruff: noqa: I001 (few lines of constants, not twenty)
 from __future__ import annotations
 
-import hashlib
 import math
-from pathlib import Path
 
 import numpy as np
-from numba import njit
 
-from . import ALPHA_MIN, BLUR, FILTER, MARGIN, NEAR
+from ..constants import BLUR, INFERENCE_MIN, NEAR_PLANE, SLOPE_MARGIN
+from .jit import jit
+from .layout import (
+    BLUE, DEPTH, GREEN, INVERSE, LOG, MX, MY, REACH_X, REACH_Y, RED, SLOPE, TILT, UX, UY, VY,
+    LOG2E, LOG_ALPHA_MIN, PARAMS,
+)  # fmt: skip
 from .simd import bits, gather, log2, select, splat, sqrt, store
+from .tiles import bin_rows
 
-TILE = 64  # pixels a side
-F32 = np.float32
-LOG2E = math.log2(math.e)
-E_MIN = F32(math.log2(ALPHA_MIN))
-E_FILTER = math.log2(FILTER)
-_SHARED = b"".join((Path(__file__).parent / name).read_bytes() for name in ("__init__.py", "simd.py", "project.py"))
-_SHARED = hashlib.sha256(_SHARED).hexdigest()[:16]
+LOG_INFERENCE_MIN = math.log2(INFERENCE_MIN)
 
 
-def serial(function):
-    """Compiles with numba, without the GIL. Its cache goes by a function's file alone, but the constants and functions
-    of the files above are compiled into others': so their contents are in the name under which it is cached."""
-    function.__qualname__ += f"_{_SHARED}"
-    return njit(cache=True, nogil=True, error_model="numpy")(function)
-
-
-# One row per Gaussian that a view shows, in the order of the input. (u, v) = L d whitens the pixel offset d = (dx, dy),
-# L = [[UX, UY], [0, VY]], scaled so that alpha = 2^(LOG - u² - v²). INVERSE = 1 / UX; SLOPE = UY / UX.
-# REACH: half sides of the box where alpha >= 1/255; TILT: dy of its rightmost point. Then the depth.
-MX, MY, UX, UY, VY, LOG, RED, GREEN, BLUE, REACH_X, REACH_Y, TILT, INVERSE, SLOPE, DEPTH = range(15)
-PARAMS = 16
-# Sums over pixels, per (tile, Gaussian) pair: d/d(r, g, b), then of h = dL/d(ln alpha) the moments in u and v.
-H, HU, HV, HUU, HUV, HVV = range(3, 9)
-SUMS = 9
-
-
-@serial
+@jit
 def all_finite(arrays):
     """Whether 1D float32 arrays hold neither NaN nor infinity."""
     bad = 0
@@ -54,9 +35,9 @@ def all_finite(arrays):
     return bad == 0
 
 
-@serial
+@jit
 def _cull(now, t, sigma_t, opacity, inference):
-    """Ids of the Gaussians that may be alive at a time, in the order of the input, and seven more to read over the end;
+    """Ids of the Gaussians that may be alive at a time, in the order of the input, and eight more to read over the end;
     how many. A quick look: `_prepare` is exact."""
     ids, count = np.empty(len(t) + 8, np.int32), 0
     most = 2.9958 if inference else 5.5413  # -ln 0.05, ln 255, rounded up
@@ -68,11 +49,11 @@ def _cull(now, t, sigma_t, opacity, inference):
     return ids, count
 
 
-@serial
-def _camera(c, c2w, intrinsics, width, height):
+@jit
+def camera_of(c, c2w, intrinsics, width, height):
     """In all lanes: axes x y z (3 each), centre (3), fx fy cx cy, and the slopes' bounds in x and y."""
     fx, fy, cx, cy = intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3]
-    mx, my = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+    mx, my = SLOPE_MARGIN * 0.5 * width / fx, SLOPE_MARGIN * 0.5 * height / fy
     return (
         (splat(c2w[c, 0, 0]), splat(c2w[c, 1, 0]), splat(c2w[c, 2, 0])),
         (splat(c2w[c, 0, 1]), splat(c2w[c, 1, 1]), splat(c2w[c, 2, 1])),
@@ -83,29 +64,29 @@ def _camera(c, c2w, intrinsics, width, height):
     )
 
 
-@serial
-def _dot(a, b):
+@jit
+def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@serial
+@jit
 def _times(m, s):
     """Row vector m times the symmetric matrix s = (xx, xy, xz, yy, yz, zz)."""
-    return _dot(m, (s[0], s[1], s[2])), _dot(m, (s[1], s[3], s[4])), _dot(m, (s[2], s[4], s[5]))
+    return dot(m, (s[0], s[1], s[2])), dot(m, (s[1], s[3], s[4])), dot(m, (s[2], s[4], s[5]))
 
 
-@serial
+@jit
 def _clamp(x, low, high):
     x = select(x > low, x, low)
     return select(x < high, x, high)
 
 
-@serial
-def _project(camera, mean, cov):
+@jit
+def project(camera, mean, cov):
     """-> camera-space centre, clamped slopes, the rows m, k of M = J W, the rows of M Σ, Σ₂ = M Σ Mᵀ + blur."""
     ax, ay, az, centre, (fx, fy, _, _), bounds = camera
     d = (mean[0] - centre[0], mean[1] - centre[1], mean[2] - centre[2])
-    p = (_dot(ax, d), _dot(ay, d), _dot(az, d))
+    p = (dot(ax, d), dot(ay, d), dot(az, d))
     rz = splat(1.0) / p[2]
     sx, sy = _clamp(p[0] * rz, bounds[0], bounds[1]), _clamp(p[1] * rz, bounds[2], bounds[3])
     jx, jy = fx * rz, fy * rz
@@ -113,11 +94,11 @@ def _project(camera, mean, cov):
     k = (jy * (ay[0] - sy * az[0]), jy * (ay[1] - sy * az[1]), jy * (ay[2] - sy * az[2]))
     ms, ks = _times(m, cov), _times(k, cov)
     blur = splat(BLUR)
-    return p, (sx, sy), (m, k), (ms, ks), (_dot(ms, m) + blur, _dot(ms, k), _dot(ks, k) + blur)
+    return p, (sx, sy), (m, k), (ms, ks), (dot(ms, m) + blur, dot(ms, k), dot(ks, k) + blur)
 
 
-@serial
-def _axes(shape, rotation, ids, at):
+@jit
+def axes_of(shape, rotation, ids, at):
     """Quaternion and scale of eight Gaussians, and the rotation's rows."""
     two, one = splat(2.0), splat(1.0)
     w, x = gather(rotation, ids, at, 4, 0), gather(rotation, ids, at, 4, 1)
@@ -131,8 +112,8 @@ def _axes(shape, rotation, ids, at):
     return (w, x, y, z), scale, R
 
 
-@serial
-def _covariance(shape, rotation, ids, at):
+@jit
+def covariance_of(shape, rotation, ids, at):
     """(xx, xy, xz, yy, yz, zz) of eight Gaussians: from scale (3) and quaternion (4), or where that is None the
     symmetric part of Σ_3 (9)."""
     if rotation is None:
@@ -146,15 +127,15 @@ def _covariance(shape, rotation, ids, at):
             gather(shape, ids, at, 9, 8),
         )
     else:
-        _, s, (a, b, c) = _axes(shape, rotation, ids, at)
+        _, s, (a, b, c) = axes_of(shape, rotation, ids, at)
         v = (s[0] * s[0], s[1] * s[1], s[2] * s[2])
         av, bv = (a[0] * v[0], a[1] * v[1], a[2] * v[2]), (b[0] * v[0], b[1] * v[1], b[2] * v[2])
         cv = (c[0] * v[0], c[1] * v[1], c[2] * v[2])
-        return _dot(av, a), _dot(av, b), _dot(av, c), _dot(bv, b), _dot(bv, c), _dot(cv, c)
+        return dot(av, a), dot(av, b), dot(av, c), dot(bv, b), dot(bv, c), dot(cv, c)
 
 
-@serial
-def _mean(ids, at, now, xyz, t, velocity):
+@jit
+def mean_of(ids, at, now, xyz, t, velocity):
     """Time since its own and place of eight Gaussians."""
     dt = now - gather(t, ids, at, 1, 0)
     return dt, (
@@ -164,25 +145,25 @@ def _mean(ids, at, now, xyz, t, velocity):
     )
 
 
-@serial
+@jit
 def _prepare(
     c, ids, count, P, xyz, t, velocity, sigma_t, shape, rotation, rgb, opacity, c2w, intrinsics, time, width, height,
     inference,
 ):  # fmt: skip
     """Fills rows of P for those of the first `count` Gaussians `ids` that view c shows, whose ids move to the front;
     how many."""
-    camera = _camera(c, c2w, intrinsics, width, height)
+    camera = camera_of(c, c2w, intrinsics, width, height)
     now, one, zero = splat(time[c]), splat(1.0), splat(0.0)
-    scale, least, filtered = splat(math.sqrt(0.5 * LOG2E)), splat(np.float64(E_MIN)), splat(E_FILTER)
-    w, h, near = splat(np.float64(width)), splat(np.float64(height)), splat(np.float64(NEAR))
+    scale, least, filtered = splat(math.sqrt(0.5 * LOG2E)), splat(np.float64(LOG_ALPHA_MIN)), splat(LOG_INFERENCE_MIN)
+    w, h, near = splat(np.float64(width)), splat(np.float64(height)), splat(np.float64(NEAR_PLANE))
     lanes, kept = np.zeros(PARAMS * 8, np.float32), 0
     for at in range(0, count, 8):
         o = gather(opacity, ids, at, 1, 0)
-        dt, mean = _mean(ids, at, now, xyz, t, velocity)
+        dt, mean = mean_of(ids, at, now, xyz, t, velocity)
         d = dt / gather(sigma_t, ids, at, 1, 0)
         marginal = splat(-0.5 * LOG2E) * d * d
         log = log2(o) + marginal
-        p, _, _, _, (sxx, sxy, syy) = _project(camera, mean, _covariance(shape, rotation, ids, at))
+        p, _, _, _, (sxx, sxy, syy) = project(camera, mean, covariance_of(shape, rotation, ids, at))
         rz = one / p[2]
         mx, my = camera[4][0] * p[0] * rz + camera[4][2], camera[4][1] * p[1] * rz + camera[4][3]
         q = (log - least) * splat(2 / LOG2E)  # squared Mahalanobis distance where alpha is 1/255
@@ -221,91 +202,13 @@ def _prepare(
     return kept
 
 
-@serial
-def _order(P):
-    """The rows of P by depth: a radix sort of the floats' bits (which sort as positive floats do), three stable passes
-    of 11 bits, so equal depths stay in the order of the input."""
-    m = len(P)
-    a, ka = np.empty(m, np.int32), np.empty(m, np.float32)
-    for i in range(m):
-        a[i], ka[i] = i, P[i, DEPTH]
-    ka = ka.view(np.uint32)
-    b, kb = np.empty_like(a), np.empty_like(ka)
-    at = np.zeros((3, 2049), np.int64)
-    for i in range(m):
-        for digit in range(3):
-            at[digit, ((ka[i] >> np.uint32(11 * digit)) & np.uint32(2047)) + 1] += 1
-    for digit in range(3):
-        shift = np.uint32(11 * digit)
-        if m and at[digit, ((ka[0] >> shift) & np.uint32(2047)) + 1] == m:
-            continue  # the same in all
-        for i in range(2048):
-            at[digit, i + 1] += at[digit, i]
-        for i in range(m):
-            d = (ka[i] >> shift) & np.uint32(2047)
-            b[at[digit, d]], kb[at[digit, d]] = a[i], ka[i]
-            at[digit, d] += 1
-        a, b, ka, kb = b, a, kb, ka
-    return a
-
-
-@serial
-def _tiles(low, high, n):
-    """First and last tile of n pixels that [low, high] touches; it touches one."""
-    return int(max(low, 0.0)) // TILE, int(min(high, n - 1.0)) // TILE
-
-
-@serial
-def _bin(P, width, height):
-    """-> starts (tiles + 1), pairs, slots, first (rows + 1): tile j is reached by the rows pairs[starts[j] :
-    starts[j + 1]] of P, front to back. Every pair has a slot of its own (slots, like pairs), which for row r are
-    first[r] to first[r + 1]. Per row of tiles the exact extent of the ellipse in that band counts, not its box."""
-    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    bound, n = 0, 0  # by boxes; an array that grew in the loop would cost reference counts on every turn
-    for r in range(len(P)):
-        left, right = _tiles(P[r, MX] - P[r, REACH_X], P[r, MX] + P[r, REACH_X], width)
-        top, bottom = _tiles(P[r, MY] - P[r, REACH_Y], P[r, MY] + P[r, REACH_Y], height)
-        bound += (right - left + 2) * (bottom - top + 2)
-    tile, first = np.empty(bound, np.int32), np.empty(len(P) + 1, np.int32)
-    starts = np.zeros(across * down + 1, np.int64)
-    for r in range(len(P)):
-        first[r] = n
-        rx, ry = np.float64(P[r, REACH_X]), np.float64(P[r, REACH_Y])
-        mx, my = np.float64(P[r, MX]), np.float64(P[r, MY])
-        top, bottom = _tiles(my - ry, my + ry, height)
-        left, right = mx - rx, mx + rx
-        for ty in range(top, bottom + 1):
-            if rx > TILE // 2:
-                low, high = max(ty * TILE - my, -ry), min(ty * TILE + TILE - my, ry)
-                a, b = min(max(-P[r, TILT], low), high), min(max(P[r, TILT], low), high)
-                s, vy = P[r, LOG] - E_MIN, P[r, VY]
-                left = mx - P[r, SLOPE] * a - math.sqrt(max(s - (vy * a) ** 2, 0.0)) * P[r, INVERSE] - 0.01
-                right = mx - P[r, SLOPE] * b + math.sqrt(max(s - (vy * b) ** 2, 0.0)) * P[r, INVERSE] + 0.01
-                if right < 0 or left > width:
-                    continue
-            left_tile, right_tile = _tiles(left, right, width)
-            for tx in range(left_tile, right_tile + 1):
-                tile[n] = ty * across + tx
-                starts[tile[n] + 1] += 1
-                n += 1
-    first[len(P)] = n
-    for j in range(across * down):
-        starts[j + 1] += starts[j]
-    pairs, slots, at = np.empty(n, np.int32), np.empty(n, np.int32), starts.copy()
-    order = _order(P)
-    for i in range(len(P)):
-        r = order[i]
-        for slot in range(first[r], first[r + 1]):
-            j = tile[slot]
-            pairs[at[j]], slots[at[j]] = r, slot
-            at[j] += 1
-    return starts, pairs, slots, first
-
-
-@serial
+@jit
 def project_view(c, inputs, cameras, width, height, inference):
-    """View c -> ids of the K Gaussians in it, in the order of the input, and seven more to read over the end; their
-    rows P (K, PARAMS); and starts, pairs, slots, first: see `_bin`."""
+    """View c -> ids of the K Gaussians in it, in the order of the input, and eight more to read over the end; their
+    rows P (K, PARAMS); and starts, pairs, slots, first: see `bin_rows`.
+
+    inputs: float32, flat: xyz (3N), t (N), velocity (3N), sigma_t (N), then scale (3N) and rotation (4N) or Σ_3 (9N)
+    and None, rgb (3N), opacity (N). cameras: float64: c2w (C,4,4), intrinsics (C,4), time (C)."""
     xyz, t, velocity, sigma_t, shape, rotation, rgb, opacity = inputs
     c2w, intrinsics, time = cameras
     ids, count = _cull(time[c], t, sigma_t, opacity, inference)
@@ -317,5 +220,5 @@ def project_view(c, inputs, cameras, width, height, inference):
         height, inference,
     )  # fmt: skip
     P = P[:count]
-    starts, pairs, slots, first = _bin(P, width, height)
+    starts, pairs, slots, first = bin_rows(P, width, height)
     return ids[: count + 8], P, starts, pairs, slots, first

@@ -11,23 +11,25 @@ rasteriser's own test of lifetimes takes a few nanoseconds, so that the index is
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from ..gaussians import Gaussians4D
-from . import FILTER
+from .constants import INFERENCE_MIN
 
-BINS = 128  # of the clip
-WORTH = 400_000  # Gaussians from which on it is quicker
+CLIP_BINS = 128  # equal parts of the clip
+QUICKER_FROM = 400_000  # Gaussians; with fewer the rasteriser's own test of lifetimes is quicker
 
 
-class Timeline:
-    """A moving scene (`Moving`) of 4D Gaussians (N,) that draws as they do with the inference filters on."""
+class LifetimeIndex:
+    """A moving scene (`Moving`) of N 4D Gaussians, without batch dimensions, that draws as they do with the inference
+    filters on. bins: equal parts of the clip, at least 1."""
 
-    def __init__(self, g: Gaussians4D, bins: int = BINS):
+    def __init__(self, g: Gaussians4D, bins: int = CLIP_BINS):
         self.gaussians = g
-        # Alive while marginal and weighted opacity reach FILTER: |t - μ_t| <= σ_t sqrt(2 ln(min(1, o) / FILTER))
-        reach = g.sigma_t * (2 * (g.opacity.clamp_max(1.0) / FILTER).clamp_min(1.0).log()).sqrt()
+        # Alive while marginal and weighted opacity reach the least: |t - μ_t| <= σ_t sqrt(2 ln(min(1, o) / least))
+        reach = g.sigma_t * (2 * (g.opacity.clamp_max(1.0) / INFERENCE_MIN).clamp_min(1.0).log()).sqrt()
         first, last = ((x + 1) / 2 * bins for x in (g.t - reach, g.t + reach))
-        drawn = ((g.opacity >= FILTER) & (last >= 0) & (first <= bins)).nonzero()[:, 0]
+        drawn = ((g.opacity >= INFERENCE_MIN) & (last >= 0) & (first <= bins)).nonzero()[:, 0]
         first = first[drawn].clamp(0, bins - 1).long()
         count = last[drawn].clamp(0, bins - 1).long() - first + 1
         who = drawn.repeat_interleave(count)
@@ -36,13 +38,15 @@ class Timeline:
         self.bins = who[order].split(where.bincount(minlength=bins).tolist())
 
     def __len__(self) -> int:
+        """How many Gaussians there are in all."""
         return len(self.gaussians)
 
-    def alive(self, t: float) -> torch.Tensor:
-        """Indices, ascending, of a set that holds all that live at time t; times beyond the clip are its ends'."""
+    def candidates(self, t: float) -> Tensor:
+        """(K) int64, ascending: the Gaussians of t's bin, among them all that live at time t in -1..1; times beyond the
+        clip are its ends'."""
         k = int((min(max(t, -1.0), 1.0) + 1) / 2 * len(self.bins))
         return self.bins[min(k, len(self.bins) - 1)]
 
     def at(self, t: float) -> Gaussians4D:
-        """Those that live about time t, as they are then, for ever (`Moving`)."""
-        return self.gaussians[self.alive(t)].frozen(t)
+        """The Gaussians of t's bin as they are at time t in -1..1, for ever (`Moving`)."""
+        return self.gaussians[self.candidates(t)].frozen(t)
