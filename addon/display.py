@@ -29,7 +29,8 @@ import numpy as np
 
 from ..datagen.rigs import CANONICAL, FOV, spherical
 from ..datagen.sequence import InputError, Normalisation
-from ..model.io.asset import VISIBLE, Asset, Clip, linear_from_srgb, read_ply, rotation_matrices
+from ..model.io.asset import VISIBLE, Asset, Clip, linear_from_srgb, rotation_matrices
+from ..model.io.ply import read_ply
 from . import nodes
 from .nodes import LOOKS, set_input
 

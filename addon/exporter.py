@@ -20,9 +20,10 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ..datagen.sequence import InputError
-from ..model.io import slices
-from ..model.io import usd_write as usd
-from ..model.io.asset import Asset, atomic, write_ply
+from ..model.io import placement, slices, usd_check, usd_write
+from ..model.io.asset import Asset
+from ..model.io.atomic import atomic_write
+from ..model.io.ply import write_ply
 from . import display, held, preferences, process
 from .importer import busy
 
@@ -50,13 +51,13 @@ MODE_ITEMS = [
 
 
 def place(asset: Asset, matrix: np.ndarray) -> Asset:
-    """The asset with its place in the world in the clip (see `slices.placed`). Raises InputError."""
+    """The asset with its place in the world in the clip (see `place_asset`). Raises InputError."""
     clip = asset.clip
     own = np.diag([clip.scale, clip.scale, clip.scale, 1.0])
     own[:3, 3] = clip.translation
     if np.allclose(matrix, own, rtol=1e-6, atol=1e-6 * clip.scale):
         return asset  # it was not moved: the clip's numbers are exacter than the object's
-    return slices.placed(asset, matrix)
+    return placement.place_asset(asset, matrix)
 
 
 def changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
@@ -74,8 +75,8 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
     """Writes and validates; returns what the validators complain about. Raises InputError."""
     python = preferences.usd_python(context)
     if not python:
-        usd.write_usd(path, asset, mode=mode, half=half, original=original, motion=motion)
-        return usd.check_usd(path)
+        usd_write.write_usd(path, asset, mode=mode, half=half, original=original, motion=motion)
+        return usd_check.check_usd(path)
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "asset.ply"
         write_ply(copy, asset)
@@ -98,7 +99,7 @@ def original_usd(ob, path: Path, frames: range, context):
         return
     beside = path.with_name(f"{path.stem}_original.usdc")
     new = not beside.exists()
-    with atomic(beside) as tmp:
+    with atomic_write(beside) as tmp:
         _export_original(ob, tmp, frames, context)
     try:
         yield beside
@@ -268,7 +269,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         asset = held.applied(ob) if self.apply_sliders else held.asset_of(ob)
         now = np.array(ob.matrix_world)
         places, animated = changes(ob, asset.clip.frames, context)
-        rest, motion = slices.apart(places)
+        rest, motion = placement.rest_and_motion(places)
         lost = animated if self.apply_sliders else []
         if self.format == "PLY":
             write_ply(path, place(asset, now))

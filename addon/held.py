@@ -14,8 +14,8 @@ import bpy
 import numpy as np
 
 from ..datagen.sequence import InputError
-from ..model.io import slices
 from ..model.io.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, check
+from ..model.io.placement import place_asset
 from . import display, nodes
 
 FRAME = 1e-3  # frames: sliders are float32, so that a clip's end may miss a whole frame by as much
@@ -139,7 +139,7 @@ def moment(ob, asset: Asset, frame: float, apply_sliders: bool = True) -> Asset:
     matrix = np.array(ob.matrix_world)
     if not seen.any() or abs(np.linalg.det(matrix[:3, :3])) < 1e-27:
         matrix, seen, alpha = np.eye(4), np.arange(len(asset)) == 0, np.zeros(len(asset))
-    return slices.placed(_masked(_still(asset, position, alpha), seen), matrix)
+    return place_asset(_masked(_still(asset, position, alpha), seen), matrix)
 
 
 # ---------------------------------------------------------------- over the timeline

@@ -21,9 +21,10 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatPrope
 from mathutils import Matrix, Quaternion
 
 from ..datagen.sequence import InputError
-from ..model.io import splat_files as formats
-from ..model.io import usd_write as usd
-from ..model.io.asset import VISIBLE, read_ply
+from ..model.io.asset import VISIBLE, LoadedAsset
+from ..model.io.files import READABLE, USD_SUFFIXES, frame_files, read_frames
+from ..model.io.ply import read_ply
+from ..model.io.usd_read import read_usd_with_motion
 from . import display, preferences, process
 
 LOOK_ITEMS = [
@@ -38,14 +39,13 @@ UP_ITEMS = [
     ("-Y", "-Y", "As in 3D Gaussian Splatting and other photogrammetry"),
 ]
 TURNS = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # about X
-SUFFIXES = (*formats.SUFFIXES, *usd.SUFFIXES)
 
 
-def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tuple[formats.Loaded, np.ndarray | None]:
+def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tuple[LoadedAsset, np.ndarray | None]:
     """One asset from a file of any kind, or from several that are one frame each; and its motion as a whole, if it
-    has one (see `usd.read_moving`). Raises InputError."""
-    if not any(p.suffix.lower() in usd.SUFFIXES for p in paths):
-        return formats.read_sequence(paths, fps=fps, frame_start=frame_start), None
+    has one (see `read_usd_with_motion`). Raises InputError."""
+    if not any(p.suffix.lower() in USD_SUFFIXES for p in paths):
+        return read_frames(paths, fps=fps, frame_start=frame_start), None
     if len(paths) > 1:
         raise InputError("USD files hold their frames themselves; import them one by one.")
     (path,) = paths
@@ -53,8 +53,8 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
         raise InputError(f"{path}: no such file; check the name.")
     python = preferences.usd_python(context)
     if not python:
-        asset, motion = usd.read_moving(path)
-        return formats.Loaded(asset, "Z"), motion
+        asset, motion = read_usd_with_motion(path)
+        return LoadedAsset(asset, "Z"), motion
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
@@ -64,7 +64,7 @@ def read(paths: list[Path], *, fps: float, frame_start: int, context=None) -> tu
             if not str(e).startswith("The process "):
                 raise  # it named the file
             raise InputError(f"{path}: the USD library gave up on it; it is damaged, export it again. {e}.") from None
-        return formats.Loaded(read_ply(copy), "Z"), np.load(moves) if moves.exists() else None
+        return LoadedAsset(read_ply(copy), "Z"), np.load(moves) if moves.exists() else None
 
 
 def animate(ob, frames: range, motion: np.ndarray) -> bool:
@@ -115,7 +115,7 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         type=bpy.types.OperatorFileListElement,
         options={"HIDDEN", "SKIP_SAVE"},
     )
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in READABLE), options={"HIDDEN"})
     look: EnumProperty(name="Look", items=LOOK_ITEMS, default="Automatic")
     opacity_cut: FloatProperty(
         name="Opacity Cut",
@@ -166,7 +166,7 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         if not self.filepath:
             raise InputError("No file was chosen; choose one, or a folder with a .ply a frame.")
         path = Path(bpy.path.abspath(self.filepath))
-        return formats.folder_files(path) if path.is_dir() else [path]
+        return frame_files(path) if path.is_dir() else [path]
 
     def execute(self, context):
         try:
@@ -203,7 +203,7 @@ class TIMESPLAT_FH_splats(bpy.types.FileHandler):
     bl_idname = "TIMESPLAT_FH_splats"
     bl_label = "4D Gaussians"
     bl_import_operator = "timesplat.import_asset"
-    bl_file_extensions = ";".join(SUFFIXES)
+    bl_file_extensions = ";".join(READABLE)
 
     @classmethod
     def poll_drop(cls, context):

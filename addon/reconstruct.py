@@ -16,7 +16,7 @@ from bpy.props import StringProperty
 from mathutils import Matrix
 
 from ..datagen.sequence import InputError
-from ..model.io.asset import read_ply, write_ply
+from ..model.io.ply import read_ply, write_ply
 from . import display, jobs, preferences, process, settings
 from .capture import shoot
 

@@ -30,7 +30,7 @@ import torch
 from timesplat.benchmarks import opensplat
 from timesplat.evaluation.tables import machine
 from timesplat.model.gaussians import FIELDS, Gaussians4D
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 from timesplat.model.rasterize import render
 from timesplat.model.rasterize.simd import ROWS
 

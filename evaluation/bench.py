@@ -32,7 +32,7 @@ from tqdm import tqdm
 from ..datagen.sequence import InputError, Sequence, read_sequence
 from ..model.fitting.budget import SECONDS
 from ..model.geometry.coverage import SURFACES, coverage
-from ..model.io.asset import write_ply
+from ..model.io.ply import write_ply
 from ..model.parallel import clock
 from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, clip_of
 from ..model.views import Views

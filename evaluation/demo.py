@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ..datagen.render import Settings, render_shots
 from ..model.gaussians import Gaussians4D
-from ..model.io.asset import write_ply
+from ..model.io.ply import write_ply
 from ..model.io.usd_write import write_usd
 from ..model.reconstruct import clip_of
 from ..model.views import Views, load_views

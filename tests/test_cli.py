@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from timesplat.cli import COMMANDS, main
-from timesplat.model.io.asset import write_ply
+from timesplat.model.io.ply import write_ply
 
 from .model.io.test_asset import make as make_asset
 

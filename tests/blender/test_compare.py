@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import Asset, Clip, write_ply
+from timesplat.model.io.asset import Asset, Clip
+from timesplat.model.io.ply import write_ply
 
 SCENE = """
 part("addon").register()

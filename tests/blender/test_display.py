@@ -11,7 +11,8 @@ import pytest
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
-from timesplat.model.io.asset import SH_C0, linear_from_srgb, read_ply, rotation_matrices, write_ply
+from timesplat.model.io.asset import SH_C0, linear_from_srgb, rotation_matrices
+from timesplat.model.io.ply import read_ply, write_ply
 
 from .helpers import make
 

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import ARRAYS, Asset, Clip, read_ply, write_ply
+from timesplat.model.io.asset import ARRAYS, Asset, Clip
+from timesplat.model.io.ply import read_ply, write_ply
 
 from .helpers import make
 from .test_display import expected_time

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from timesplat.model.io import slices
-from timesplat.model.io.asset import ARRAYS, VISIBLE, read_ply, write_ply
+from timesplat.model.io.asset import ARRAYS, VISIBLE
+from timesplat.model.io.ply import read_ply, write_ply
 
 from .helpers import make
 

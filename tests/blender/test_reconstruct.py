@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 
 ANIMATE = """
 import time

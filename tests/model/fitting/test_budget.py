@@ -13,7 +13,7 @@ from timesplat.model.fitting.budget import fewest, parse, reduced
 from timesplat.model.fitting.merge import contribution
 from timesplat.model.fitting.refine import error
 from timesplat.model.geometry.lift import lift
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 from timesplat.model.reconstruct import reconstruct_views
 
 

@@ -12,7 +12,7 @@ from timesplat.evaluation.evaluate import evaluate_method, parse_method
 from timesplat.model.fitting.refine import JUDGES, around, error, judging, part, refine, start_size
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 from timesplat.model.reconstruct import reconstruct_views
 
 
