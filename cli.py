@@ -137,7 +137,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     from .model import baselines  # noqa: F401, adds its methods
     from .model.clip import clip_of
     from .model.geometry.coverage import coverage
-    from .model.io.asset import write_ply
+    from .model.io.ply import write_ply
     from .model.methods import ReconstructOptions, method_named
     from .model.reconstruct import reconstruct as run
     from .model.views import load_views
@@ -170,7 +170,8 @@ def reconstruct(args: argparse.Namespace) -> int:
 
 
 def export_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote, or a USD file of Timesplat's")
+    p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote, or another "
+                   "file of Gaussians: 3DGS .ply, .splat, .spz, USD; or a folder with a .ply a frame")  # fmt: skip
     p.add_argument("out", type=Path, nargs="?", help=".usdc, .usda, .usdz, .ply, .blend to write; .splat with --frame")
     p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
                    "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
@@ -186,40 +187,43 @@ def export(args: argparse.Namespace) -> int:
     """Export an asset: USD (Gaussian splats that older readers take as points), 3DGS .ply slices, or a .blend."""
     import tempfile
 
-    from .model.io.asset import read_ply, write_ply
-    from .model.io.slices import write_slice, write_slices
-    from .model.io.usd_write import SUFFIXES, check_usd, read_moving, write_usd
+    from .model.io.files import WRITABLE, read_asset, write_asset
+    from .model.io.slices import write_slices
+    from .model.io.usd_check import check_usd
+    from .model.io.usd_stage import USD_SUFFIXES
 
-    usd = args.out is not None and args.out.suffix.lower() in SUFFIXES
+    suffix = args.out.suffix.lower() if args.out else ""
+    usd = suffix in USD_SUFFIXES
     if (args.out is None) == (args.sequence is None):
         raise InputError("export: name one file to write, or a folder by --sequence.")
     if not usd and (args.mode != "splats" or args.half or args.original or args.check):
         raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
     if args.frame is not None and (usd or args.sequence):
         raise InputError("export: --frame is for one .ply or .splat; drop it.")
-    given = args.asset.suffix.lower() in SUFFIXES
-    asset, motion = read_moving(args.asset) if given else (read_ply(args.asset), None)
-    if motion is not None and not usd:
+    loaded = read_asset(args.asset)
+    asset, count = loaded.asset, len(loaded.asset)
+    if loaded.note:
+        print(f"{args.asset}: {loaded.note}")
+    if loaded.up != "Z":
+        print(f"{args.asset}: {loaded.up} is up in it, as far as is known; nothing is turned, Z is taken for up")
+    if loaded.motion is not None and not usd:
         print(f"{args.asset}: it moves as a whole; what is written stands where that starts, USD would keep it")
     if args.sequence:
-        count = write_slices(args.sequence, asset, args.asset.stem)
-        print(f"{args.sequence}: {count} files")
+        print(f"{args.sequence}: {write_slices(args.sequence, asset, args.asset.stem)} files")
         return 0
-    count = len(asset)
-    if args.frame is not None:
-        count = write_slice(args.out, asset, args.frame)
-    elif usd:
-        more = {"original": args.original, "original_start": args.original_start}
-        write_usd(args.out, asset, mode=args.mode, half=args.half, motion=motion, **more)
-    elif args.out.suffix.lower() == ".ply":
-        write_ply(args.out, asset)
-    elif args.out.suffix.lower() == ".blend":
+    if suffix == ".blend" and args.frame is None:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             ply = Path(folder) / f"{args.asset.stem}.ply"
-            write_ply(ply, asset)
+            write_asset(ply, asset)
             save_blend(ply, args.out)
-    else:
+    elif suffix not in WRITABLE and args.frame is None:
         raise InputError(f"{args.out}: cannot write that; choose .usdc, .usda, .usdz, .ply or .blend.")
+    else:
+        options = {}
+        if usd:
+            options = {"mode": args.mode, "half": args.half, "motion": loaded.motion}
+            options |= {"original": args.original, "original_start": args.original_start}
+        count = write_asset(args.out, asset, frame=args.frame, **options)
     print(f"{args.out}: {count} Gaussians, {args.out.stat().st_size / 1e6:.1f} MB")
     complaints = check_usd(args.out) if usd else []
     for complaint in complaints:

@@ -33,7 +33,7 @@ from timesplat.benchmarks.cameras import ring
 from timesplat.benchmarks.timing import least
 from timesplat.evaluation.provenance import machine
 from timesplat.model.gaussians import FIELDS, Gaussians4D
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 from timesplat.model.rasterize import render
 from timesplat.model.rasterize.constants import ALPHA_MIN, BLUR
 from timesplat.model.rasterize.cpu.simd import ROWS

@@ -16,8 +16,11 @@ import numpy as np
 
 from timesplat.benchmarks.timing import least
 from timesplat.evaluation.provenance import machine
-from timesplat.model.io.asset import ARRAYS, Asset, read_ply
-from timesplat.model.io.usd_write import MODES, check_usd, read_usd, write_usd
+from timesplat.model.io.asset import ARRAYS, Asset
+from timesplat.model.io.ply import read_ply
+from timesplat.model.io.usd_check import check_usd
+from timesplat.model.io.usd_read import read_usd
+from timesplat.model.io.usd_write import MODES, write_usd
 
 
 def rows(asset: Asset) -> list[str]:

@@ -44,7 +44,7 @@ def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
     from ..datagen.farm import render_shots
     from ..datagen.render_job import RenderSettings
     from ..model.clip import clip_of
-    from ..model.io.asset import write_ply
+    from ..model.io.ply import write_ply
     from ..model.io.usd_write import write_usd
     from . import protocol
     from .cache import Cache

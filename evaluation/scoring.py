@@ -14,7 +14,7 @@ from ..datagen.sequence import InputError, Sequence
 from ..model.clip import clip_of
 from ..model.gaussians import Gaussians4D, Moving
 from ..model.geometry.coverage import coverage
-from ..model.io.asset import write_ply
+from ..model.io.ply import write_ply
 from ..model.methods import METHODS, ReconstructOptions
 from ..model.parallel import clock
 from ..model.rasterize import render

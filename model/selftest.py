@@ -151,7 +151,9 @@ def _USD(s) -> str:
     except ImportError:
         return "usd-core is not there; all but export and import of USD works"
     from .io.asset import Clip
-    from .io.usd_write import check_usd, read_usd, write_usd
+    from .io.usd_check import check_usd
+    from .io.usd_read import read_usd
+    from .io.usd_write import write_usd
 
     asset = s.lifted.to_asset(Clip(24.0, 0, FRAMES - 1))
     path = s.folder / "sphere.usdc"

@@ -18,7 +18,7 @@ to do; null or "" is the same as leaving a key out:
         done: out, complaints (the validator's, a list of sentences), bytes
     import          the other way round             (never imports torch)
         source      .usd* to read                   asset       .ply to write
-        motion      .npy to write where the asset moves as a whole (see read_moving)
+        motion      .npy to write where the asset moves as a whole (see read_usd_with_motion)
         done: asset, gaussians
     selftest        does this interpreter reconstruct?
         device, checkpoint
@@ -104,7 +104,7 @@ def _reconstruct(request: dict, progress) -> dict:
     max_loss = request.get("max_loss", 0.1)
     if not (math.isfinite(max_loss) and max_loss > 0):
         raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
-    from .io.asset import write_ply
+    from .io.ply import write_ply
 
     refine, budget, checkpoint = request.get("refine", 0.0), request.get("budget"), request.get("checkpoint")
     if not (refine or budget):
@@ -151,8 +151,9 @@ def _limit_memory() -> None:
 
 def _export(request: dict, progress) -> dict:
     _limit_memory()
-    from .io.asset import read_ply
-    from .io.usd_write import check_usd, write_usd
+    from .io.ply import read_ply
+    from .io.usd_check import check_usd
+    from .io.usd_write import write_usd
 
     out = Path(request["out"])
     progress(0.0, "reading the asset")
@@ -179,11 +180,11 @@ def _matrices(path: str) -> np.ndarray:
 
 def _import(request: dict, progress) -> dict:
     _limit_memory()
-    from .io.asset import write_ply
-    from .io.usd_write import read_moving
+    from .io.ply import write_ply
+    from .io.usd_read import read_usd_with_motion
 
     progress(0.0, f"reading {Path(request['source']).name}")
-    asset, motion = read_moving(request["source"])
+    asset, motion = read_usd_with_motion(request["source"])
     progress(0.7, "writing the asset")
     write_ply(request["asset"], asset)
     if motion is not None and "motion" in request:

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from timesplat.cli import COMMANDS, main
-from timesplat.model.io.asset import write_ply
+from timesplat.model.io.ply import read_ply, write_ply
 
-from .model.io.test_asset import make as make_asset
+from .assets import make_asset
 
 
 def refused(capsys, *argv, says: str, names: str = "") -> None:
@@ -121,6 +121,16 @@ def test_assets_to_export(tmp_path, capsys):
     cut.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n1234")
     refused(capsys, "export", cut, tmp_path / "a.usdc", says="cut.ply")
     assert not (tmp_path / "a.usdc").exists()
+
+
+def test_other_programs_files_are_exported_and_how_they_lie_is_said(tmp_path, capsys):
+    write_ply(tmp_path / "a.ply", make_asset())
+    for words in ("a.ply a.splat --frame 20", "a.splat b.ply", "a.ply --sequence frames", "frames c.ply"):
+        arguments = [w if w.startswith("--") or w.isdigit() else str(tmp_path / w) for w in words.split()]
+        assert main(["export", *arguments]) == 0
+        assert ("-Y is up in it" in capsys.readouterr().out) == (words in ("a.splat b.ply", "frames c.ply"))
+    assert (tmp_path / "b.ply").stat().st_size > 1000 and read_ply(tmp_path / "c.ply").clip.frames == range(1, 25)
+    refused(capsys, "export", tmp_path / "a.obj", tmp_path / "d.ply", says="its name must end in", names="a.obj")
 
 
 def test_files_that_no_renderer_takes(tmp_path, capsys):

@@ -176,7 +176,7 @@ def test_no_torch_near_blender_and_no_blender_near_torch(name):
 
 def test_the_face_is_light():
     """The root and the torch-free rooms load without torch, bpy or pxr, the worker before it is asked."""
-    rooms = ("model.io.asset", "model.io.usd_write", "model.worker", "cli")
+    rooms = ("model.io.asset", "model.io.usd_write", "model.io.files", "model.worker", "cli")
     code = f"import sys, {', '.join(f'timesplat.{r}' for r in rooms)}\n"
     code += "print([m for m in ('torch', 'bpy', 'pxr', 'numba', 'PIL') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

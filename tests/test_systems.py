@@ -20,16 +20,17 @@ from timesplat.datagen.farm import render_assets
 from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.sequence import InputError, move, read_sequence
 from timesplat.model import worker
-from timesplat.model.io import asset
+from timesplat.model.io import atomic
+from timesplat.model.io.ply import write_ply
 
+from .assets import make_asset
 from .datagen.test_sequence import make as make_sequence
-from .model.io.test_asset import make as make_asset
 
 
 @pytest.fixture
 def windows(monkeypatch):
     """The modules believe that they run on Windows; a pause takes no time."""
-    for module in (sequence, asset, process):
+    for module in (sequence, atomic, process):
         monkeypatch.setattr(module, "WINDOWS", True)
     monkeypatch.setattr(sequence.time, "sleep", lambda seconds: None)
 
@@ -69,11 +70,11 @@ def test_elsewhere_nobody_is_waited_for(tmp_path, held, monkeypatch):
 
 def test_a_file_that_stays_open_is_named_with_the_remedy(tmp_path, windows, held):
     path = tmp_path / "a.ply"
-    asset.write_ply(path, make_asset(3))
+    write_ply(path, make_asset(3))
     before = path.read_bytes()
     held(path, 99)
     with pytest.raises(InputError, match=r"a\.ply: it cannot be written \(Access is denied\); close the program that"):
-        asset.write_ply(path, make_asset(4))
+        write_ply(path, make_asset(4))
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.ply"]
 
 
@@ -144,7 +145,7 @@ def test_names_of_any_alphabet_in_a_sequence(tmp_path):
 
 
 def test_the_command_line_says_what_the_console_cannot(tmp_path):
-    asset.write_ply(tmp_path / "足.ply", make_asset(3))
+    write_ply(tmp_path / "足.ply", make_asset(3))
     code = "import sys\nfrom timesplat.cli import main\nsys.exit(main(sys.argv[1:]))"
     done = foreign(code, "export", tmp_path / "足.ply", tmp_path / "手.ply")
     assert done.returncode == 0 and b"3 Gaussians" in done.stdout, done.stderr.decode()
@@ -152,7 +153,7 @@ def test_the_command_line_says_what_the_console_cannot(tmp_path):
 
 def test_the_worker_understands_any_name_on_any_console(tmp_path):
     """Requests and answers are ASCII; what it logs is UTF-8."""
-    asset.write_ply(tmp_path / "足.ply", make_asset(3))
+    write_ply(tmp_path / "足.ply", make_asset(3))
     request = {"task": "export", "asset": str(tmp_path / "足.ply"), "out": "手"}
     done = subprocess.run(
         [sys.executable, "-X", "utf8", "-c", process.launch("model.worker")],

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...datagen.sequence import InputError
-from ...model.io import slices
 from ...model.io.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip, check
+from ...model.io.placement import place_asset
 from .asset_object import asset_of, read_attribute, slider_values
 from .sliders import SLIDERS
 
@@ -74,7 +74,7 @@ def moment(ob, asset: Asset, frame: float, apply_sliders: bool = True) -> Asset:
     matrix = np.array(ob.matrix_world)
     if not seen.any() or abs(np.linalg.det(matrix[:3, :3])) < 1e-27:
         matrix, seen, alpha = np.eye(4), np.arange(len(asset)) == 0, np.zeros(len(asset))
-    return slices.placed(_masked(_without_time(asset, position, alpha), seen), matrix)
+    return place_asset(_masked(_without_time(asset, position, alpha), seen), matrix)
 
 
 def peak_opacity(asset: Asset) -> np.ndarray:

@@ -14,7 +14,7 @@ import bpy
 
 from ...datagen.rigs import CANONICAL, FOV, spherical
 from ...datagen.sequence import InputError, Normalisation
-from ...model.io.asset import read_ply
+from ...model.io.ply import read_ply
 from .display import TRANSPARENT_BOUNCES, add_asset, play_clip
 
 

@@ -21,8 +21,11 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ...datagen.sequence import InputError
 from ...model.io import slices
-from ...model.io import usd_write as usd
-from ...model.io.asset import Asset, write_ply
+from ...model.io.asset import Asset
+from ...model.io.files import write_asset
+from ...model.io.placement import place_asset, rest_and_motion
+from ...model.io.ply import write_ply
+from ...model.io.usd_check import check_usd
 from ..asset.apply_sliders import moment, with_sliders
 from ..asset.asset_object import asset_of, slider_values
 from ..asset.sliders import is_asset
@@ -53,13 +56,13 @@ MODE_ITEMS = [
 
 
 def with_place(asset: Asset, matrix: np.ndarray) -> Asset:
-    """The asset with its place in the world in the clip (see `slices.placed`). Raises InputError."""
+    """The asset with its place in the world in the clip (see `place_asset`). Raises InputError."""
     clip = asset.clip
     own = np.diag([clip.scale, clip.scale, clip.scale, 1.0])
     own[:3, 3] = clip.translation
     if np.allclose(matrix, own, rtol=1e-6, atol=1e-6 * clip.scale):
         return asset  # it was not moved: the clip's numbers are exacter than the object's
-    return slices.placed(asset, matrix)
+    return place_asset(asset, matrix)
 
 
 def places_and_changes(ob, frames: range, context) -> tuple[np.ndarray, list[str]]:
@@ -77,8 +80,8 @@ def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path
     """Writes and validates; returns what the validators complain about. Raises InputError."""
     python = worker_options.usd_python(context)
     if not python:
-        usd.write_usd(path, asset, mode=mode, half=half, original=original, motion=motion)
-        return usd.check_usd(path)
+        write_asset(path, asset, mode=mode, half=half, original=original, motion=motion)
+        return check_usd(path)
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "asset.ply"
         write_ply(copy, asset)
@@ -193,7 +196,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         frame = scene.frame_current_final
         if self.format in ("SLICE", "SPLAT"):
             part = moment(ob, asset_of(ob), frame, self.apply_sliders)
-            count = slices.write_slice(path, part, frame, cut=0)
+            count = write_asset(path, part, frame=frame, cut=0)
             if not part.opacity.any():
                 return "WARNING", f"Nothing is shown at frame {frame:g}; one clear Gaussian stands in."
             return "INFO", f"{count} Gaussians of frame {frame:g}."
@@ -208,10 +211,10 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         asset = with_sliders(ob) if self.apply_sliders else asset_of(ob)
         now = np.array(ob.matrix_world)
         places, animated = places_and_changes(ob, asset.clip.frames, context)
-        rest, motion = slices.apart(places)
+        rest, motion = rest_and_motion(places)
         lost = animated if self.apply_sliders else []
         if self.format == "PLY":
-            write_ply(path, with_place(asset, now))
+            write_asset(path, with_place(asset, now))
             lost = lost + ["place"] * (motion is not None)
             level, said = "INFO", f"{len(asset)} Gaussians."
         elif self.with_original:

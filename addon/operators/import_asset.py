@@ -20,9 +20,10 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatPrope
 from mathutils import Matrix, Quaternion
 
 from ...datagen.sequence import InputError
-from ...model.io import splat_files as formats
-from ...model.io import usd_write as usd
-from ...model.io.asset import VISIBLE, read_ply
+from ...model.io.asset import VISIBLE, LoadedAsset
+from ...model.io.files import READABLE, frame_files, read_frames
+from ...model.io.ply import read_ply
+from ...model.io.usd_stage import USD_SUFFIXES
 from ..asset import display
 from ..runtime import child_process, worker_options
 from .common import wait_cursor
@@ -39,25 +40,15 @@ UP_ITEMS = [
     ("-Y", "-Y", "As in 3D Gaussian Splatting and other photogrammetry"),
 ]
 TURN_ABOUT_X = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # radians
-SUFFIXES = (*formats.SUFFIXES, *usd.SUFFIXES)
 
 
-def read_asset(
-    paths: list[Path], *, fps: float, frame_start: int, context=None
-) -> tuple[formats.Loaded, np.ndarray | None]:
-    """One asset from a file of any kind, or from several that are one frame each; and its motion as a whole, if it
-    has one (see `usd.read_moving`). Raises InputError."""
-    if not any(p.suffix.lower() in usd.SUFFIXES for p in paths):
-        return formats.read_sequence(paths, fps=fps, frame_start=frame_start), None
-    if len(paths) > 1:
-        raise InputError("USD files hold their frames themselves; import them one by one.")
+def read_assets(paths: list[Path], *, fps: float, frame_start: int, context=None) -> LoadedAsset:
+    """One asset from a file of any kind, or from several that are one frame each (see `files.read_frames`); a USD file
+    by the worker, where there is one. Raises InputError."""
+    python = worker_options.usd_python(context) if any(p.suffix.lower() in USD_SUFFIXES for p in paths) else None
+    if not python or len(paths) > 1 or not paths[0].is_file():
+        return read_frames(paths, fps=fps, frame_start=frame_start)
     (path,) = paths
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; check the name.")
-    python = worker_options.usd_python(context)
-    if not python:
-        asset, motion = usd.read_moving(path)
-        return formats.Loaded(asset, "Z"), motion
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
@@ -67,7 +58,7 @@ def read_asset(
             if not str(e).startswith("The process "):
                 raise  # it named the file
             raise InputError(f"{path}: the USD library gave up on it; it is damaged, export it again. {e}.") from None
-        return formats.Loaded(read_ply(copy), "Z"), np.load(moves) if moves.exists() else None
+        return LoadedAsset(read_ply(copy), "Z", motion=np.load(moves) if moves.exists() else None)
 
 
 def key_motion(ob, frames: range, motion: np.ndarray) -> bool:
@@ -106,7 +97,7 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         type=bpy.types.OperatorFileListElement,
         options={"HIDDEN", "SKIP_SAVE"},
     )
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in READABLE), options={"HIDDEN"})
     look: EnumProperty(name="Look", items=LOOK_ITEMS, default="Automatic")
     opacity_cut: FloatProperty(
         name="Opacity Cut",
@@ -157,13 +148,13 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         if not self.filepath:
             raise InputError("No file was chosen; choose one, or a folder with a .ply a frame.")
         path = Path(bpy.path.abspath(self.filepath))
-        return formats.folder_files(path) if path.is_dir() else [path]
+        return frame_files(path) if path.is_dir() else [path]
 
     def execute(self, context):
         try:
             paths = self.paths()
             with wait_cursor(context):
-                loaded, motion = read_asset(paths, fps=self.fps, frame_start=self.frame_start, context=context)
+                loaded = read_assets(paths, fps=self.fps, frame_start=self.frame_start, context=context)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}
@@ -175,9 +166,9 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         ob = display.add_asset(asset, name, look=self.look, cut=self.opacity_cut, context=context)
         ob.rotation_euler.x = TURN_ABOUT_X[loaded.up if self.up == "AUTO" else self.up]
         note = loaded.note
-        if motion is not None:
+        if loaded.motion is not None:
             context.view_layer.update()
-            if not key_motion(ob, asset.clip.frames, motion):
+            if not key_motion(ob, asset.clip.frames, loaded.motion):
                 note = "It moves in a way that shears it, which is left out: it stands where that starts."
         if self.use_clip:
             display.play_clip(context.scene, asset.clip)
@@ -194,7 +185,7 @@ class TIMESPLAT_FH_splats(bpy.types.FileHandler):
     bl_idname = "TIMESPLAT_FH_splats"
     bl_label = "4D Gaussians"
     bl_import_operator = "timesplat.import_asset"
-    bl_file_extensions = ";".join(SUFFIXES)
+    bl_file_extensions = ";".join(READABLE)
 
     @classmethod
     def poll_drop(cls, context):

@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 
 from ...datagen.sequence import InputError
-from ...model.io.asset import atomic
+from ...model.io.atomic import atomic_write
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def original_usd(ob, path: Path, frames: range, context):
         return
     beside = path.with_name(f"{path.stem}_original.usdc")
     new = not beside.exists()
-    with atomic(beside) as tmp:
+    with atomic_write(beside) as tmp:
         _export_original(ob, tmp, frames, context)
     try:
         yield beside

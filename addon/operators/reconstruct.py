@@ -17,7 +17,7 @@ from bpy.props import StringProperty
 from mathutils import Matrix
 
 from ...datagen.sequence import InputError
-from ...model.io.asset import read_ply, write_ply
+from ...model.io.ply import read_ply, write_ply
 from .. import estimates, settings
 from ..asset.display import add_asset
 from ..asset.parenting import follow

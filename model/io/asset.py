@@ -1,42 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A 4D Gaussian asset as arrays, and its .ply file. numpy only, so that it runs inside Blender.
-
-The file is a binary little-endian PLY with the property names of 3D Gaussian Splatting, so that viewers of
-those show it (every Gaussian at its own time), followed by t, scale_t, vx, vy, vz. Two things are left out:
-normals, which no splat viewer uses, and f_rest_*, because the colour does not depend on the direction.
-Clip metadata stands in `comment timesplat <key> <value>` lines. See docs of `write_ply` for the units.
-"""
+"""A 4D Gaussian asset as arrays. numpy only, so that it runs inside Blender."""
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from ...datagen.sequence import WINDOWS, InputError, Sequence, move
+from ...datagen.sequence import InputError, Sequence
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C0 * f_dc
 VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment (the paper's filter)
 STATIC_SIGMA_T = 1e4  # lifetime of what does not change: exp(-½(2/1e4)²) is 1 in float32
-BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
-LONGEST, LAST = 50_000, 1 << 20  # frames: more than half an hour; and as far as Blender counts
-OPACITY_EPS = 1e-6  # opacities are kept this far from 0 and 1 in a .ply, where they are logits
-
-VERSION = 1
-GAUSSIAN_3D = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
-TIME_4D = ("t", "scale_t", "vx", "vy", "vz")
-_TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"}
-_TYPES |= {"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"}
-_TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
-_MAX_HEADER = 1 << 16
+ONE_FRAME_SIGMA = 1 / 3  # σ_t, in frames, of what shows at one frame: 1.1 % of its opacity is left a frame away
+SCREEN_BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
+MAX_GAUSSIANS = 10_000_000  # that a compressed file or a sequence may hold, as in Niantic's reader
+MAX_CLIP_FRAMES = 50_000  # more than half an hour
+MAX_FRAME_NUMBER = 1 << 20  # as far as Blender counts
 
 
 @dataclass(frozen=True)
@@ -93,9 +74,9 @@ class Asset:
 
     def soft_scale(self) -> np.ndarray:
         """(N,3) standard deviations as they looked in the pictures that the asset was fitted to, where the
-        rasteriser blurred by BLUR px². Renderers which do not, or at a higher resolution, show holes
+        rasteriser blurred by SCREEN_BLUR px². Renderers which do not, or at a higher resolution, show holes
         between Gaussians with the plain `scale`. Equal to it where clip.pixel is 0."""
-        return np.sqrt(self.scale**2 + np.float32(BLUR * self.clip.pixel**2))
+        return np.sqrt(self.scale**2 + np.float32(SCREEN_BLUR * self.clip.pixel**2))
 
     def softened(self) -> Asset:
         """The same with `soft_scale` for good (clip.pixel 0), for viewers that know nothing of pixels."""
@@ -104,6 +85,32 @@ class Asset:
 
 ARRAYS = tuple(f.name for f in fields(Asset) if f.name != "clip")
 _WIDTHS = {"xyz": 3, "velocity": 3, "scale": 3, "rotation": 4, "rgb": 3}
+
+
+@dataclass(frozen=True)
+class LoadedAsset:
+    """What a file held. `up`: the axis that points up in it, "Z" in our own files and in what is read from USD, "Y" in
+    .spz as Niantic defines it, "-Y" in .ply and .splat, which say nothing, as in the captures that 3DGS is trained on.
+    `motion`: (F,4,4) where the asset is taken at each frame of its clip, in the world, from where the clip places it;
+    None where it does not move as a whole."""
+
+    asset: Asset
+    up: str
+    note: str = ""  # what was left out, for the artist; a sentence or nothing
+    motion: np.ndarray | None = None
+
+
+def static_asset(source: str | Path, xyz, scale, rotation, rgb, opacity) -> Asset:
+    """An asset that does not change from arrays of any float dtype, as in Asset; quaternions are normalised. Raises
+    InputError (see `check`)."""
+    length = np.linalg.norm(rotation, axis=1, keepdims=True)
+    rotation = np.where(length > 0, rotation / np.maximum(length, 1e-30), [1.0, 0, 0, 0])
+    n = len(xyz)
+    arrays = {"xyz": xyz, "t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
+    arrays |= {"scale": scale, "rotation": rotation, "rgb": rgb, "opacity": opacity}
+    asset = Asset(**{k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()})
+    check(asset, source)
+    return asset
 
 
 def check(asset: Asset, source: str | Path = "the asset") -> None:
@@ -138,7 +145,7 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
         raise bad("fps and scale must be positive, pixel not negative, and these and translation finite")
     if len(c.translation) != 3 or c.frame_end < c.frame_start:
         raise bad("the clip's frame range is empty or its translation is not three numbers")
-    if c.frame_end - c.frame_start >= LONGEST or max(abs(c.frame_start), abs(c.frame_end)) > LAST:
+    if c.frame_end - c.frame_start >= MAX_CLIP_FRAMES or max(abs(c.frame_start), abs(c.frame_end)) > MAX_FRAME_NUMBER:
         raise bad(f"the clip's frames run from {c.frame_start} to {c.frame_end}, which is too many or too far")
 
 
@@ -158,187 +165,17 @@ def rotation_matrices(q: np.ndarray) -> np.ndarray:
     return np.stack(rows, -1).reshape(-1, 3, 3)
 
 
+def wxyz_from_xyzw(q: np.ndarray) -> np.ndarray:
+    """Quaternions (N,4) in the order of other programs -> in ours."""
+    return q[:, [3, 0, 1, 2]]
+
+
+def xyzw_from_wxyz(q: np.ndarray) -> np.ndarray:
+    """Quaternions (N,4) in our order -> in that of other programs."""
+    return q[:, [1, 2, 3, 0]]
+
+
 def linear_from_srgb(rgb: np.ndarray) -> np.ndarray:
     """sRGB-encoded values (any shape) -> linear light, clamped to 0..1."""
     x = np.clip(rgb, 0, 1)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """Yields a name beside `path` (same suffix) to write to; it is moved to `path` on success, removed on
-    any error. The folder is made. An OSError becomes an InputError that names the path."""
-    path = Path(path)
-    tmp = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield tmp
-        move(tmp, path)
-    except OSError as e:
-        todo = "choose another place"
-        if WINDOWS and isinstance(e, PermissionError) and path.is_file():
-            todo = f"close the program that has it open, or {todo}"
-        raise InputError(f"{path}: it cannot be written ({e.strerror or e}); {todo}.") from None
-    finally:
-        with suppress(OSError):  # where the folder is a file, say
-            tmp.unlink(missing_ok=True)
-
-
-# ---------------------------------------------------------------- .ply
-
-
-def write_ply(path: str | Path, asset: Asset) -> None:
-    """Writes the asset; the file appears whole or not at all. Raises InputError (see `check`).
-
-    Positions and velocities are in normalised units (per unit of model time), f_dc = (rgb - 0.5)/SH_C0,
-    opacity is a logit, scale_* and scale_t are natural logs, rot_* is w x y z. Reading gives the same
-    values back to float32 precision (a relative 1e-6), except that opacities nearer than 1e-6 to 0 or 1
-    are moved to that distance."""
-    check(asset, path)
-    o = np.clip(asset.opacity.astype(np.float64), OPACITY_EPS, 1 - OPACITY_EPS)
-    columns = [
-        asset.xyz,
-        (asset.rgb.astype(np.float64) - 0.5) / SH_C0,
-        np.log(o / (1 - o))[:, None],
-        np.log(asset.scale.astype(np.float64)),
-        asset.rotation,
-        asset.t[:, None],
-        np.log(asset.sigma_t.astype(np.float64))[:, None],
-        asset.velocity,
-    ]
-    table = np.concatenate([c.astype("<f4") for c in columns], 1)
-    c = asset.clip
-    meta = {"version": VERSION, "fps": repr(float(c.fps)), "frame_start": c.frame_start}
-    meta |= {"frame_end": c.frame_end, "scale": repr(float(c.scale))}
-    meta |= {"translation": " ".join(repr(float(x)) for x in c.translation), "colour_space": "sRGB"}
-    meta |= {"pixel": repr(float(c.pixel))}
-    header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment timesplat {k} {v}" for k, v in meta.items()]
-    header += [f"element vertex {len(asset)}", *(f"property float {p}" for p in GAUSSIAN_3D + TIME_4D)]
-    with atomic(Path(path)) as tmp, open(tmp, "wb") as f:
-        f.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-        f.write(table.tobytes())
-
-
-def read_ply(path: str | Path) -> Asset:
-    """Reads what `write_ply` wrote, or any uncompressed binary 3DGS .ply: without the time columns it is a
-    static asset (v = 0, t = 0, sigma_t = STATIC_SIGMA_T), without comments the clip is Clip(). Unknown
-    properties (normals, f_rest_*) are passed over; quaternions are normalised, zero ones become the
-    identity. Raises InputError: one sentence with the file, what is wrong and what to do."""
-    path = Path(path)
-    try:
-        with open(path, "rb") as f:
-            head = f.read(_MAX_HEADER)
-            names, dtype, count, meta, offset = _header(head, path)
-            have = os.fstat(f.fileno()).st_size - offset
-            if have < count * dtype.itemsize:
-                raise InputError(
-                    f"{path}: the file is truncated, {count} Gaussians were announced and there is data for "
-                    f"{have // dtype.itemsize}; copy or export it again."
-                )
-            f.seek(offset)
-            rows = np.fromfile(f, dtype, count)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the name.") from None
-    except OSError as e:
-        raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
-    missing = [p for p in GAUSSIAN_3D if p not in names]
-    if missing:
-        hint = "it is a compressed splat file" if "packed_position" in names else "it is not a Gaussian splat"
-        raise InputError(
-            f"{path}: the property {missing[0]} is missing, {hint}; export it as an uncompressed 3DGS .ply."
-        )
-    time = [p for p in TIME_4D if p in names]
-    if time and len(time) < len(TIME_4D):
-        lost = next(p for p in TIME_4D if p not in names)
-        raise InputError(f"{path}: it has {time[0]} but lacks {lost}; export it again from Timesplat.")
-
-    def get(*props: str) -> np.ndarray:
-        out = np.stack([rows[p] for p in props], -1).astype(np.float64)
-        wrong = ~np.isfinite(out)
-        if wrong.any():
-            prop = props[int(wrong.any(0).argmax())]
-            raise InputError(
-                f"{path}: {prop} holds NaN or infinity in {wrong.any(1).sum()} of {count} Gaussians; "
-                "remove those Gaussians or export the file again."
-            )
-        return out
-
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
-        quaternion = get("rot_0", "rot_1", "rot_2", "rot_3")
-        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-        quaternion = np.where(length > 0, quaternion / np.maximum(length, 1e-300), [1.0, 0, 0, 0])
-        arrays = {
-            "xyz": get("x", "y", "z"),
-            "t": get("t")[:, 0] if time else np.zeros(count),
-            "velocity": get("vx", "vy", "vz") if time else np.zeros((count, 3)),
-            "sigma_t": np.exp(get("scale_t"))[:, 0] if time else np.full(count, STATIC_SIGMA_T),
-            "scale": np.exp(get("scale_0", "scale_1", "scale_2")),
-            "rotation": quaternion,
-            "rgb": 0.5 + SH_C0 * get("f_dc_0", "f_dc_1", "f_dc_2"),
-            "opacity": 1 / (1 + np.exp(-get("opacity")[:, 0])),
-        }
-        asset = Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=_clip(meta, path))
-    check(asset, path)
-    return asset
-
-
-def _header(head: bytes, path: Path) -> tuple[list[str], np.dtype, int, dict[str, str], int]:
-    """-> property names, row dtype, number of rows, `comment timesplat` values, where the data begins."""
-    if not re.match(rb"ply\r?\n", head):
-        raise InputError(f"{path}: it is not a .ply file; choose a Gaussian splat .ply.")
-    end = re.search(rb"\nend_header\r?\n", head)
-    if end is None:
-        raise InputError(f"{path}: the header has no end, the file is truncated; copy or export it again.")
-    order, count, props, meta, elements = None, 0, [], {}, []
-    try:
-        for line in head[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
-            word = line.split()
-            if word[:1] == ["format"]:
-                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(word[1])
-                if order is None:
-                    raise InputError(f"{path}: its format is {word[1]}; convert it to a binary .ply.")
-            elif word[:2] == ["comment", "timesplat"]:
-                meta[word[2]] = " ".join(word[3:])
-            elif word[:1] == ["element"]:
-                elements.append(word[1])
-                if word[1] == "vertex":
-                    count = int(word[2])
-            elif word[:1] == ["property"] and elements[-1] == "vertex":
-                if order is None:
-                    raise ValueError("it names no format")
-                props.append((word[2], order + _TYPES[word[1]]))
-        if elements[:1] != ["vertex"]:
-            first = elements[0] if elements else "nothing"
-            raise InputError(
-                f"{path}: its first element is {first}, not vertex; export it as an uncompressed 3DGS .ply."
-            )
-        if count < 0 or not props:
-            raise ValueError("no vertices")
-        dtype = np.dtype(props)
-    except InputError:
-        raise
-    except (ValueError, KeyError, IndexError, TypeError) as e:
-        raise InputError(f"{path}: the header is damaged ({e}); copy or export it again.") from None
-    return [p for p, _ in props], dtype, count, meta, end.end()
-
-
-def _clip(meta: dict[str, str], path: Path) -> Clip:
-    if not meta:
-        return Clip()
-    try:
-        if int(meta["version"]) > VERSION:
-            raise InputError(f"{path}: it was written by a newer Timesplat; update yours.")
-        x, y, z = (float(v) for v in meta["translation"].split())
-        return Clip(
-            fps=float(meta["fps"]),
-            frame_start=int(meta["frame_start"]),
-            frame_end=int(meta["frame_end"]),
-            scale=float(meta["scale"]),
-            translation=(x, y, z),
-            pixel=float(meta.get("pixel", 0)),
-        )
-    except (KeyError, ValueError) as e:
-        if isinstance(e, InputError):
-            raise
-        raise InputError(f"{path}: the clip's comments are damaged ({e}); export it again.") from None

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads other programs' Gaussian splats: numpy and the standard library only, for inside Blender.
+"""Readers of other programs' Gaussian splats, one for each kind of file; `files.read_asset` chooses among them.
+numpy and the standard library only, for inside Blender.
 
-3DGS .ply (by `asset.read_ply`), SuperSplat's compressed .ply, .splat (antimatter15), .spz (Niantic, versions 1
-to 4), and any of these a frame as a sequence. Colour that depends on the direction (spherical harmonics beyond
-degree 0) is left out. Nothing of a file is believed before it is checked; what is wrong with it is one
-InputError. The other way, one moment of a 4D asset for other programs: slices.py.
+3DGS .ply (by `read_ply`), SuperSplat's compressed .ply, .splat (antimatter15), .spz (Niantic, versions 1 to 4). Colour
+that depends on the direction (spherical harmonics beyond degree 0) is left out. Nothing of a file is believed before
+it is checked; what is wrong with it is one InputError. The other way, one moment of a 4D asset for other programs:
+slices.py.
 
 Sources: github.com/nianticlabs/spz (README.md, load-spz.cc), github.com/antimatter15/splat (convert.py),
 github.com/playcanvas/splat-transform (compressed-chunk.ts).
@@ -14,24 +15,23 @@ from __future__ import annotations
 
 import gzip
 import io
-import re
 import struct
 import zlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from ...datagen.sequence import InputError
-from .asset import SH_C0, STATIC_SIGMA_T, Asset, Clip, check, read_ply
+from .asset import MAX_GAUSSIANS, SH_C0, Asset, LoadedAsset, static_asset, wxyz_from_xyzw
+from .ply import MAX_HEADER_BYTES, read_ply
 
-SUFFIXES = (".ply", ".splat", ".spz")
-MOST = 10_000_000  # Gaussians that a compressed file or a sequence may hold, as in Niantic's reader
-SHARE = 1 / 3  # σ_t of a sequence's Gaussians in frames: 1.1 % of their opacity is left a frame away
-_MAX_HEADER = 1 << 16
-_KINDS = {  # how files begin that may turn up under one of our suffixes
+SCALE_BOUNDS = ("scale_x", "scale_y", "scale_z")  # of a compressed .ply's chunks
+SPLAT_RECORD = np.dtype(
+    [("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgb", "u1", 3), ("opacity", "u1"), ("rotation", "u1", 4)]
+)
+_FILE_SIGNATURES = {  # how files begin that may turn up under one of our suffixes
     b"ply": "a .ply file",
     b"\x1f\x8b": "a gzip file, as .spz files are",
     b"NGSP": "an .spz file",
@@ -53,129 +53,39 @@ _KINDS = {  # how files begin that may turn up under one of our suffixes
 }
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """What a file held. `up`: the axis that points up in it, "Z" in our own files, "Y" in .spz as Niantic
-    defines it, "-Y" in .ply and .splat, which say nothing, as in the captures that 3DGS is trained on."""
-
-    asset: Asset
-    up: str
-    note: str = ""  # what was left out, for the artist; a sentence or nothing
-
-
-# ---------------------------------------------------------------- reading
-
-
-def read(path: str | Path) -> Loaded:
-    """Reads one file by its suffix. Raises InputError: one sentence that names the file and says what it is
-    and what was expected."""
-    path = Path(path)
-    reader = {".ply": _read_any_ply, ".splat": _read_splat, ".spz": _read_spz}.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: its name must end in {', '.join(SUFFIXES)}; choose one of these.")
-    if path.is_dir():
-        raise InputError(f"{path}: it is a folder; choose a {path.suffix} file.")
-    try:
-        return reader(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the name.") from None
-    except OSError as e:
-        raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
-    except MemoryError:
-        raise InputError(f"{path}: it takes more memory than there is; close other programs or reduce it.") from None
-
-
-def read_sequence(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: int = 1) -> Loaded:
-    """One asset from a file a frame, in the natural order of the names (2 before 10): file k is frame
-    frame_start + k. One file alone is what `read` gives.
-
-    The Gaussians of a file stand still and have σ_t = SHARE frames: at their own frame they have their whole
-    opacity, at the neighbouring ones exp(-4.5) = 1.1 % of it, which is below VISIBLE, and half-way between
-    two frames 32 %, so that both files are seen faintly. Raises InputError, also where files are 4D already
-    or differ in their up axis."""
-    paths = sorted(map(Path, paths), key=_natural)
-    if not paths:
-        raise InputError("No file was chosen; choose the .ply files of a sequence.")
-    if len(paths) == 1:
-        return read(paths[0])
-    clip = Clip(fps, frame_start, frame_start + len(paths) - 1)
-    sigma_t = np.float32(SHARE * 2 / (len(paths) - 1))
-    parts, ups, notes, total = [], set(), [], 0
-    for frame, path in zip(clip.frames, paths, strict=True):
-        loaded = read(path)
-        asset, n = loaded.asset, len(loaded.asset)
-        total += n
-        ups.add(loaded.up)
-        notes.append(loaded.note)
-        if len(ups) > 1 or (asset.sigma_t != STATIC_SIGMA_T).any():
-            raise InputError(f"{path}: it is no frame of a sequence (4D already, or of another kind); import it alone.")
-        if total > MOST:
-            raise InputError(f"{path}: with it the sequence has more than {MOST:,} Gaussians; choose fewer files.")
-        own = np.full(n, clip.frame_to_time(frame), np.float32)
-        parts.append(replace(asset, t=own, sigma_t=np.full(n, sigma_t)))
-    arrays = {k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0]) if k != "clip"}
-    asset = Asset(**arrays, clip=clip)
-    check(asset, paths[0].parent)
-    return Loaded(asset, ups.pop(), next(filter(None, notes), ""))
-
-
-def folder_files(folder: str | Path) -> list[Path]:
-    """The .ply files right in a folder, in natural order. Raises InputError if there is none."""
-    folder = Path(folder)
-    try:
-        found = [p for p in folder.iterdir() if p.suffix.lower() == ".ply" and not p.name.startswith(".")]
-    except OSError as e:
-        raise InputError(f"{folder}: it cannot be read ({e.strerror or e}); check the folder.") from None
-    if not found:
-        raise InputError(f"{folder}: there is no .ply file in this folder; choose one with a .ply a frame.")
-    return sorted(found, key=_natural)
-
-
-def _natural(path: Path) -> list:
-    """Sorts numbers in names by their value."""
-    return [(int(w), "") if w.isdecimal() else (-1, w.lower()) for w in re.split(r"(\d+)", path.name) if w]
-
-
-def _wrong_kind(path: Path, head: bytes, otherwise: str) -> InputError:
-    what = next((kind for magic, kind in _KINDS.items() if head.startswith(magic)), None)
+def _wrong_file(path: Path, head: bytes, otherwise: str) -> InputError:
+    what = next((kind for magic, kind in _FILE_SIGNATURES.items() if head.startswith(magic)), None)
     if what is None:
         return InputError(f"{path}: {otherwise}; choose a Gaussian splat {path.suffix}.")
     return InputError(f"{path}: it is {what}, not a Gaussian splat {path.suffix}; choose another file.")
 
 
-def static(source: str | Path, xyz, scale, rotation, rgb, opacity) -> Asset:
-    """An asset that does not change from arrays of any float dtype; quaternions are normalised."""
-    length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    rotation = np.where(length > 0, rotation / np.maximum(length, 1e-30), [1.0, 0, 0, 0])
-    n = len(xyz)
-    arrays = {"xyz": xyz, "t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
-    arrays |= {"scale": scale, "rotation": rotation, "rgb": rgb, "opacity": opacity}
-    asset = Asset(**{k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()})
-    check(asset, source)
-    return asset
+def _note(harmonics: bool) -> str:
+    return "Its colours that depend on the direction (spherical harmonics) are left out." if harmonics else ""
 
 
-def _largest(which: np.ndarray, three: np.ndarray) -> np.ndarray:
+def _with_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N,4) unit quaternions from the place of the largest component (N,), which is positive and left out,
     and the three others (N,3) in their order."""
-    q = np.empty((len(which), 4), np.float32)
+    q = np.empty((len(largest), 4), np.float32)
     for i in range(4):
-        at = which == i
-        q[np.ix_(at, [k for k in range(4) if k != i])] = three[at]
-        q[at, i] = np.sqrt(np.maximum(0, 1 - (three[at] ** 2).sum(1)))
+        at = largest == i
+        q[np.ix_(at, [k for k in range(4) if k != i])] = others[at]
+        q[at, i] = np.sqrt(np.maximum(0, 1 - (others[at] ** 2).sum(1)))
     return q
 
 
 # ---------------------------------------------------------------- .ply
 
 
-def _read_any_ply(path: Path) -> Loaded:
+def read_any_ply(path: Path) -> LoadedAsset:
+    """Our own .ply, other programs' 3DGS .ply, and SuperSplat's compressed one."""
     with open(path, "rb") as f:
-        head, found, _ = f.read(_MAX_HEADER).partition(b"end_header")
+        head, found, _ = f.read(MAX_HEADER_BYTES).partition(b"end_header")
     if not head.startswith(b"ply"):
-        raise _wrong_kind(path, head, "it is not a .ply file")
+        raise _wrong_file(path, head, "it is not a .ply file")
     if found and b" packed_position" in head:
-        return Loaded(_read_compressed(path), "-Y", _note(b"element sh " in head))
+        return LoadedAsset(_read_compressed(path), "-Y", _note(b"element sh " in head))
     if found and b" f_dc_0" not in head:
         what = "a polygon mesh" if b"element face" in head else "a plain point cloud"
         raise InputError(
@@ -183,58 +93,40 @@ def _read_any_ply(path: Path) -> Loaded:
         )
     asset = read_ply(path)
     ours = b"comment timesplat " in head or b" scale_t" in head
-    return Loaded(asset, "Z" if ours else "-Y", _note(b" f_rest_0" in head))
-
-
-def _note(harmonics: bool) -> str:
-    return "Its colours that depend on the direction (spherical harmonics) are left out." if harmonics else ""
+    return LoadedAsset(asset, "Z" if ours else "-Y", _note(b" f_rest_0" in head))
 
 
 def _read_compressed(path: Path) -> Asset:
-    """SuperSplat's compressed .ply: chunks of 256 Gaussians, quantised between the chunk's bounds."""
-    types = {"float": "<f4", "uint": "<u4", "uchar": "u1", "float32": "<f4", "uint32": "<u4", "uint8": "u1"}
-    with open(path, "rb") as f:
-        data = f.read()
-    head, _, _ = data.partition(b"end_header")
-    tables, at = {}, data.index(b"\n", len(head)) + 1 if b"\n" in data[len(head) :] else len(data)
+    """Chunks of 256 Gaussians, quantised between the chunk's bounds."""
     try:
-        if b"format binary_little_endian" not in head:
-            raise ValueError("it is not binary, little-endian")
-        for element in head.decode("ascii", "replace").split("\nelement ")[1:]:
-            first, *rows = element.splitlines()
-            name, count = first.split()
-            if int(count) < 0:
-                raise ValueError(f"{count} of {name}")
-            words = [r.split() for r in rows if r.startswith("property")]
-            dtype = np.dtype([(w[2], types[w[1]]) for w in words])
-            tables[name] = np.frombuffer(data, dtype, int(count), at)
-            at += int(count) * dtype.itemsize
+        tables = _ply_tables(path.read_bytes())
         chunk, rows = tables["chunk"], tables["vertex"]
         if len(chunk) != -(-len(rows) // 256):
             raise ValueError(f"{len(chunk)} chunks do not belong to {len(rows)} Gaussians")
 
-        def between(names: tuple[str, ...], share: np.ndarray) -> np.ndarray:
+        def between(names: tuple[str, ...], shares: np.ndarray) -> np.ndarray:
             """(N,k) values from shares 0..1 of the way between the bounds of each one's chunk."""
             low, high = (np.stack([chunk[f"{m}_{n}"] for n in names], 1) for m in ("min", "max"))
-            return np.repeat(low, 256, 0)[: len(rows)] * (1 - share) + np.repeat(high, 256, 0)[: len(rows)] * share
+            return np.repeat(low, 256, 0)[: len(rows)] * (1 - shares) + np.repeat(high, 256, 0)[: len(rows)] * shares
 
-        def bits(name: str, *widths: int) -> np.ndarray:
-            """(N,k) shares 0..1: the unsigned numbers of these widths that fill 32 bits from the top."""
-            shifts = 32 - np.cumsum(widths)
-            masks = (1 << np.array(widths)) - 1
-            return ((rows[name][:, None] >> shifts.astype(np.uint32)) & masks) / masks
+        def unpacked(name: str, *widths: int) -> list[np.ndarray]:
+            """Shares 0..1, (N,) each: the unsigned numbers of these widths that fill 32 bits from the top."""
+            shifts, masks = 32 - np.cumsum(widths), [(1 << width) - 1 for width in widths]
+            return [((rows[name] >> np.uint32(s)) & np.uint32(m)) / m for s, m in zip(shifts, masks, strict=True)]
 
-        colour = bits("packed_color", 8, 8, 8, 8)
-        rgb = between(("r", "g", "b"), colour[:, :3]) if "min_r" in chunk.dtype.names else colour[:, :3]
-        turn = bits("packed_rotation", 2, 10, 10, 10)
+        *rgb, opacity = unpacked("packed_color", 8, 8, 8, 8)
+        rgb = np.stack(rgb, 1)
+        if "min_r" in chunk.dtype.names:
+            rgb = between(("r", "g", "b"), rgb)
+        largest, *others = unpacked("packed_rotation", 2, 10, 10, 10)
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
-            return static(
+            return static_asset(
                 path,
-                xyz=between(("x", "y", "z"), bits("packed_position", 11, 10, 11)),
-                scale=np.exp(between(("scale_x", "scale_y", "scale_z"), bits("packed_scale", 11, 10, 11))),
-                rotation=_largest(np.round(turn[:, 0] * 3), (turn[:, 1:] - 0.5) * np.sqrt(2)),
+                xyz=between(("x", "y", "z"), np.stack(unpacked("packed_position", 11, 10, 11), 1)),
+                scale=np.exp(between(SCALE_BOUNDS, np.stack(unpacked("packed_scale", 11, 10, 11), 1))),
+                rotation=_with_largest(np.round(largest * 3), (np.stack(others, 1) - 0.5) * np.sqrt(2)),
                 rgb=rgb,
-                opacity=colour[:, 3],
+                opacity=opacity,
             )
     except InputError:
         raise
@@ -242,19 +134,36 @@ def _read_compressed(path: Path) -> Asset:
         raise InputError(f"{path}: the compressed .ply is truncated or damaged ({e}); export it again.") from None
 
 
+def _ply_tables(data: bytes) -> dict[str, np.ndarray]:
+    """Every element of a binary little-endian .ply without lists as a record array."""
+    types = {"float": "<f4", "uint": "<u4", "uchar": "u1", "float32": "<f4", "uint32": "<u4", "uint8": "u1"}
+    head, _, _ = data.partition(b"end_header")
+    tables, at = {}, data.index(b"\n", len(head)) + 1 if b"\n" in data[len(head) :] else len(data)
+    if b"format binary_little_endian" not in head:
+        raise ValueError("it is not binary, little-endian")
+    for element in head.decode("ascii", "replace").split("\nelement ")[1:]:
+        first, *lines = element.splitlines()
+        name, count = first.split()
+        if int(count) < 0:
+            raise ValueError(f"{count} of {name}")
+        words = [line.split() for line in lines if line.startswith("property")]
+        dtype = np.dtype([(w[2], types[w[1]]) for w in words])
+        tables[name] = np.frombuffer(data, dtype, int(count), at)
+        at += int(count) * dtype.itemsize
+    return tables
+
+
 # ---------------------------------------------------------------- .splat
 
-SPLAT = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
-
-def _read_splat(path: Path) -> Loaded:
+def read_splat(path: Path) -> LoadedAsset:
     """32 bytes a Gaussian and nothing else, so that only implausible values tell another kind of file."""
     data = path.read_bytes()
     if not data:
         raise InputError(f"{path}: it is empty; choose a Gaussian splat .splat.")
-    if len(data) % SPLAT.itemsize:
-        raise _wrong_kind(path, data, f"it is truncated or not a .splat ({len(data)} bytes are not a multiple of 32)")
-    rows = np.frombuffer(data, SPLAT)
+    if len(data) % SPLAT_RECORD.itemsize:
+        raise _wrong_file(path, data, f"it is truncated or not a .splat ({len(data)} bytes are not a multiple of 32)")
+    rows = np.frombuffer(data, SPLAT_RECORD)
     xyz, scale = rows["xyz"], rows["scale"]
     rotation = rows["rotation"].astype(np.float32) / 128 - 1
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 0.1
@@ -262,16 +171,15 @@ def _read_splat(path: Path) -> Loaded:
         sane = (np.abs(xyz) < 1e9).all(1) & (scale >= 0).all(1) & (scale < 1e9).all(1)
     if not sane.all() or unit.mean() < 0.9:
         wrong = (~(sane & unit)).sum()
-        raise _wrong_kind(path, data, f"it is damaged or not a .splat ({wrong} of {len(rows)} Gaussians make no sense)")
-    rgba = rows["rgba"].astype(np.float32) / 255
-    asset = static(path, xyz, np.maximum(scale, 1e-9), rotation, rgba[:, :3], rgba[:, 3])
-    return Loaded(asset, "-Y")
+        raise _wrong_file(path, data, f"it is damaged or not a .splat ({wrong} of {len(rows)} Gaussians make no sense)")
+    rgb, opacity = (rows[name].astype(np.float32) / 255 for name in ("rgb", "opacity"))
+    return LoadedAsset(static_asset(path, xyz, np.maximum(scale, 1e-9), rotation, rgb, opacity), "-Y")
 
 
 # ---------------------------------------------------------------- .spz
 
 
-def _read_spz(path: Path) -> Loaded:
+def read_spz(path: Path) -> LoadedAsset:
     """Versions 1 to 3 are one gzip stream, version 4 has a zstd stream for each property. Only what is needed
     is unpacked, and never more than the header's count asks for."""
     try:
@@ -281,7 +189,7 @@ def _read_spz(path: Path) -> Loaded:
             if magic == b"NGSP":
                 return _spz(path, *_zstd_sections(path, f))
             if magic[:2] != b"\x1f\x8b":
-                raise _wrong_kind(path, magic + f.read(16)[4:], "it is not an .spz file")
+                raise _wrong_file(path, magic + f.read(16)[4:], "it is not an .spz file")
             stream = gzip.GzipFile(fileobj=f)
             head = stream.read(16)
             if head[:4] != b"NGSP":
@@ -324,12 +232,15 @@ def _zstd_sections(path: Path, f) -> tuple[bytes, Callable[[int, int], bytes]]:
     return head, section
 
 
-def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> Loaded:
+def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> LoadedAsset:
+    """head: from its magic number on; section: from a property's size and number to its bytes."""
     version, n, degree, fraction = struct.unpack_from("<IIBB", head, 4)
     if not 1 <= version <= 4:
         raise InputError(f"{path}: it is .spz version {version}, known are 1 to 4; export it as version 3.")
-    if not 0 < n <= MOST or fraction > 30:
-        raise InputError(f"{path}: it claims {n:,} Gaussians; 1 to {MOST:,} can be read, and it may be damaged.")
+    if not 0 < n <= MAX_GAUSSIANS or fraction > 30:
+        raise InputError(
+            f"{path}: it claims {n:,} Gaussians; 1 to {MAX_GAUSSIANS:,} can be read, and it may be damaged."
+        )
     widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3)
     if n > 100_000 and sum(widths) * n > 100 * path.stat().st_size:  # splats pack to a third; this is a bomb
         raise EOFError(f"{n} Gaussians were announced, and so few bytes hold no more than repetition")
@@ -340,25 +251,30 @@ def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> Loade
             raise EOFError(f"{n} Gaussians were announced, and there are fewer")
         parts.append(np.frombuffer(data, np.uint8).reshape(n, width))
     xyz, alpha, colour, scale, turn = parts
-    if version == 1:
-        xyz = xyz.view("<f2").astype(np.float32)
-    else:  # signed numbers of 24 bits
-        whole = (xyz.reshape(n, 3, 3).astype(np.int32) << np.array([0, 8, 16], np.int32)).sum(-1, dtype=np.int32)
-        xyz = np.ldexp(((whole ^ 0x800000) - 0x800000).astype(np.float32), -fraction)
-    if version >= 3:
-        word = turn.view("<u4")[:, 0]
-        three = (word[:, None] >> np.array([20, 10, 0], np.uint32)) & 0x3FF  # sign, nine bits
-        three = np.where(three >> 9, -1, 1) * (three & 0x1FF) * np.float32(np.sqrt(0.5) / 511)
-        rotation = _largest(word >> 30, three)
-    else:
-        three = turn.astype(np.float32) / 127.5 - 1
-        rotation = np.concatenate([three, np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True)))], 1)
-    asset = static(
+    asset = static_asset(
         path,
-        xyz=xyz,
+        xyz=xyz.view("<f2").astype(np.float32) if version == 1 else np.ldexp(_signed_24_bits(xyz), -fraction),
         scale=np.exp(scale.astype(np.float32) / 16 - 10),
-        rotation=rotation[:, [3, 0, 1, 2]],  # x y z w in the file
+        rotation=wxyz_from_xyzw(_spz_rotation(turn, version)),
         rgb=0.5 + SH_C0 / 0.15 * (colour.astype(np.float32) / 255 - 0.5),
-        opacity=alpha[:, 0].astype(np.float32) / 255,
+        opacity=alpha.squeeze(1).astype(np.float32) / 255,
     )
-    return Loaded(asset, "Y", _note(degree > 0))
+    return LoadedAsset(asset, "Y", _note(degree > 0))
+
+
+def _signed_24_bits(data: np.ndarray) -> np.ndarray:
+    """(N,9) bytes -> (N,3) numbers as float32."""
+    whole = (data.reshape(-1, 3, 3).astype(np.int32) << np.array([0, 8, 16], np.int32)).sum(-1, dtype=np.int32)
+    return ((whole ^ 0x800000) - 0x800000).astype(np.float32)
+
+
+def _spz_rotation(data: np.ndarray, version: int) -> np.ndarray:
+    """(N,4) bytes, or (N,3) before version 3 -> (N,4) quaternions x y z w."""
+    if version < 3:
+        imaginary = data.astype(np.float32) / 127.5 - 1
+        real = np.sqrt(np.maximum(0, 1 - (imaginary**2).sum(1, keepdims=True)))
+        return np.concatenate([imaginary, real], 1)
+    word = data.view("<u4").squeeze(1)
+    others = (word[:, None] >> np.array([20, 10, 0], np.uint32)) & 0x3FF  # sign, nine bits
+    others = np.where(others >> 9, -1, 1) * (others & 0x1FF) * np.float32(np.sqrt(0.5) / 511)
+    return _with_largest(word >> 30, others)

@@ -4,99 +4,48 @@
 from __future__ import annotations
 
 import re
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...datagen.sequence import InputError
-from .asset import LONGEST, SH_C0, STATIC_SIGMA_T, Asset, Clip, check
-from .slices import apart, placed
-from .splat_files import MOST, SHARE
-
-SPLAT = "ParticleField3DGaussianSplat"
-SH = "radiance:sphericalHarmonicsCoefficients"
-VARIANTS = "representation"  # the variant set of files that hold the original object too
-RECONSTRUCTION, ORIGINAL = "reconstruction", "original"
-
-
-def pxr():
-    """-> Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt. Raises InputError where there is no USD library."""
-    try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
-    except ImportError:
-        raise InputError(f"{sys.executable} lacks usd-core, which USD files need; install timesplat[usd].") from None
-    return Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keeps USD's warnings, some lines each, off standard error; errors are raised all the same."""
-    delegate = pxr()[4].CoalescingDiagnosticDelegate()
-    try:
-        yield
-    finally:
-        delegate.TakeUncoalescedDiagnostics()
-        del delegate
-
-
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """`quiet`, and an InputError for what USD and numpy raise over damaged files."""
-    with quiet():
-        try:
-            yield
-        except InputError:
-            raise
-        except (RuntimeError, ValueError, TypeError, IndexError, OverflowError, MemoryError):
-            raise InputError(f"{path}: it is damaged or not a USD file; export it again.") from None
-
-
-def open_stage(path: Path):
-    """The Usd.Stage of a file, inside of `reading`. Raises InputError: no such file."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; check the name.")
-    return pxr()[2].Stage.Open(str(path))
-
-
-def select(stage, variant: str) -> bool:
-    """Selects `variant` of every set VARIANTS that has it, for this opened stage alone; False if none has."""
-    Usd = pxr()[2]
-    sets = [p.GetVariantSets().GetVariantSet(VARIANTS) for p in stage.TraverseAll() if p.HasVariantSets()]
-    sets = [s for s in sets if variant in s.GetVariantNames()]
-    with Usd.EditContext(stage, stage.GetSessionLayer()):
-        for s in sets:
-            s.SetVariantSelection(variant)
-    return bool(sets)
-
-
-def metres_per_unit(stage, path: Path) -> float:
-    """Raises InputError where it is no positive number."""
-    metres = pxr()[3].GetStageMetersPerUnit(stage)
-    if not (np.isfinite(metres) and metres > 0):
-        raise InputError(f"{path}: its metersPerUnit is {metres:g}; set it to a positive number.")
-    return metres
-
-
-def prims(stage):
-    """Every prim of the stage, those inside of instances too."""
-    return stage.Traverse(pxr()[2].TraverseInstanceProxies())
+from .asset import (
+    MAX_CLIP_FRAMES,
+    MAX_GAUSSIANS,
+    ONE_FRAME_SIGMA,
+    SH_C0,
+    STATIC_SIGMA_T,
+    Asset,
+    Clip,
+    check,
+    wxyz_from_xyzw,
+)
+from .placement import place_asset, rest_and_motion
+from .usd_stage import (
+    RECONSTRUCTION,
+    SH_COEFFICIENTS,
+    SPLAT_TYPE,
+    all_prims,
+    import_pxr,
+    metres_per_unit,
+    open_stage,
+    reading,
+    select,
+)
 
 
 def read_usd(path: str | Path) -> Asset:
-    """`read_moving` without the motion: where it moves as a whole the asset stands where that starts."""
-    return read_moving(path)[0]
+    """`read_usd_with_motion` without the motion: where it moves as a whole the asset stands where that starts."""
+    return read_usd_with_motion(path)[0]
 
 
-def read_moving(path: str | Path) -> tuple[Asset, np.ndarray | None]:
+def read_usd_with_motion(path: str | Path) -> tuple[Asset, np.ndarray | None]:
     """The asset in a file that `write_usd` wrote (any mode), or in a stage that references one: its transforms,
     upAxis, metersPerUnit and retiming are applied, and the asset's clip leads to metres, Z up. Failing that,
     the splats of another program, without what depends on the direction; where they change over time, as
     Gaussians that live for one frame each. And where its prim or what is above it moves over time, that motion:
-    (F,4,4) for each frame of the clip, in the world, from where the clip places the asset (see `apart`).
+    (F,4,4) for each frame of the clip, in the world, from where the clip places the asset (see `rest_and_motion`).
 
     Raises InputError: no such file, not USD, no splats or several of them, a transform that is flat, arrays that
     do not belong together."""
@@ -108,27 +57,28 @@ def read_moving(path: str | Path) -> tuple[Asset, np.ndarray | None]:
 def _read(path: Path) -> tuple[Asset, np.ndarray | None]:
     stage = open_stage(path)
     select(stage, RECONSTRUCTION)
-    found = [p for p in prims(stage) if p.HasAttribute("primvars:gs4d:mu_t")]
+    found = [p for p in all_prims(stage) if p.HasAttribute("primvars:gs4d:mu_t")]
     ours = bool(found)
-    found = found or [p for p in prims(stage) if p.GetTypeName() == SPLAT]
+    found = found or [p for p in all_prims(stage) if p.GetTypeName() == SPLAT_TYPE]
     if not found:
         for error in stage.GetCompositionErrors():
             if lost := re.search(r"Could not open asset @(.+?)@", str(error)):
                 raise InputError(f"{path}: it refers to {lost[1]}, which cannot be opened; find that file.")
-        raise InputError(f"{path}: no prim is a {SPLAT} or has primvars:gs4d:*; choose a USD file with splats.")
+        raise InputError(f"{path}: no prim is a {SPLAT_TYPE} or has primvars:gs4d:*; choose a USD file with splats.")
     if len(found) > 1:
         names = ", ".join(str(p.GetPath()) for p in found[:3]) + (", …" if len(found) > 3 else "")
         raise InputError(f"{path}: it holds {len(found)} assets ({names}); open one of their own files.")
     asset = _read_4d(path, stage, found[0]) if ours else _read_others(path, stage, found[0])
     check(asset, path)
-    return _placed(asset, path, stage, found[0])
+    return _in_the_world(asset, path, stage, found[0])
 
 
-def _get(path: Path, prim, *names: str, code=None) -> np.ndarray:
+def _values(path: Path, prim, *names: str, code=None) -> np.ndarray:
     """The first of the attributes that has a value, as float32, at a time code or else at the first one."""
     for name in names:
         attribute = prim.GetAttribute(name)
-        value = attribute.Get(pxr()[2].TimeCode.EarliestTime() if code is None else code) if attribute else None
+        at = import_pxr().Usd.TimeCode.EarliestTime() if code is None else code
+        value = attribute.Get(at) if attribute else None
         if value is not None:
             return np.asarray(value).astype(np.float32)
     raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
@@ -136,7 +86,7 @@ def _get(path: Path, prim, *names: str, code=None) -> np.ndarray:
 
 def _clip(path: Path, stage, start: float, end: float, pixel: float = 0.0) -> Clip:
     """The whole frames around two time codes; the nearest one where they are the same."""
-    if not end - start < LONGEST:
+    if not end - start < MAX_CLIP_FRAMES:
         raise InputError(f"{path}: its frames run from {start:g} to {end:g}, that is too many; export it again.")
     first, last = int(np.floor(start + 1e-6)), int(np.ceil(end - 1e-6))
     if start == end:
@@ -145,13 +95,15 @@ def _clip(path: Path, stage, start: float, end: float, pixel: float = 0.0) -> Cl
 
 
 def _read_4d(path: Path, stage, prim) -> Asset:
-    def get(*names: str) -> np.ndarray:
-        return _get(path, prim, *names)
+    """A prim of Timesplat's, in its own space."""
 
-    rgb = prim.HasAttribute("primvars:gs4d:rgb")
-    rgb = get("primvars:gs4d:rgb") if rgb else 0.5 + SH_C0 * get(SH, f"{SH}h").astype(np.float64)
-    rotation = get("orientations", "orientationsh", "primvars:gs4d:rotation")[:, [3, 0, 1, 2]]
-    rotation = _unit(rotation)
+    def get(*names: str) -> np.ndarray:
+        return _values(path, prim, *names)
+
+    if prim.HasAttribute("primvars:gs4d:rgb"):
+        rgb = get("primvars:gs4d:rgb")
+    else:
+        rgb = _rgb(get(SH_COEFFICIENTS, f"{SH_COEFFICIENTS}h"))
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     if prim.HasAttribute("gs4d:time"):
         start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # one sample, where the clip is one frame
@@ -168,8 +120,8 @@ def _read_4d(path: Path, stage, prim) -> Asset:
         velocity=velocity,
         sigma_t=sigma_t,
         scale=get("primvars:gs4d:scale"),
-        rotation=rotation,
-        rgb=rgb.astype(np.float32),
+        rotation=_unit(wxyz_from_xyzw(get("orientations", "orientationsh", "primvars:gs4d:rotation"))),
+        rgb=rgb,
         opacity=get("primvars:gs4d:opacity"),
         clip=clip,
     )
@@ -180,63 +132,71 @@ def _unit(quaternion: np.ndarray) -> np.ndarray:
         return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
 
 
+def _rgb(sh: np.ndarray) -> np.ndarray:
+    """(N,3) coefficients of the constant spherical harmonic -> (N,3) sRGB-encoded, float32."""
+    return (0.5 + SH_C0 * sh.astype(np.float64)).astype(np.float32)
+
+
 def _read_others(path: Path, stage, prim) -> Asset:
-    names = ("positions", "scales", "orientations", "opacities", SH)
+    """A prim of another program's, in its own space."""
+    names = ("positions", "scales", "orientations", "opacities", SH_COEFFICIENTS)
     attributes = [prim.GetAttribute(k) for n in names for k in (n, f"{n}h")]
     codes = sorted({c for a in attributes if a for c in a.GetTimeSamples()})
     clip = _clip(path, stage, codes[0], codes[-1]) if len(codes) > 1 else Clip(stage.GetTimeCodesPerSecond(), 0, 0)
     first, last = clip.frame_start, clip.frame_end
+    sigma_t = ONE_FRAME_SIGMA * 2 / (last - first) if last > first else STATIC_SIGMA_T
     parts, total = [], 0
     for frame in clip.frames:
         code = frame if len(codes) > 1 else codes[0] if codes else None
-        xyz, scale, quaternion, opacity, sh = (_get(path, prim, n, f"{n}h", code=code) for n in names)
+        xyz, scale, quaternion, opacity, sh = (_values(path, prim, n, f"{n}h", code=code) for n in names)
         n = len(xyz)
         total += n
-        if total > MOST:
-            raise InputError(f"{path}: it has more than {MOST:,} Gaussians over its frames; export fewer frames.")
+        if total > MAX_GAUSSIANS:
+            raise InputError(
+                f"{path}: it has more than {MAX_GAUSSIANS:,} Gaussians over its frames; export fewer frames."
+            )
         if n == 0 or len(sh) == 0 or len(sh) % n or quaternion.ndim != 2:
             raise InputError(f"{path}: {len(sh)} SH coefficients cannot belong to {n} splats; export it again.")
-        rotation = _unit(quaternion)[:, [3, 0, 1, 2]]
         parts.append({
             "xyz": xyz,
             "t": np.full(n, clip.frame_to_time(frame), np.float32),
             "velocity": np.zeros_like(xyz),
-            "sigma_t": np.full(n, SHARE * 2 / (last - first) if last > first else STATIC_SIGMA_T, np.float32),
+            "sigma_t": np.full(n, sigma_t, np.float32),
             "scale": np.maximum(scale, np.float32(1e-9)),
-            "rotation": rotation,
-            "rgb": (0.5 + SH_C0 * sh[:: len(sh) // n].astype(np.float64)).astype(np.float32),
+            "rotation": wxyz_from_xyzw(_unit(quaternion)),
+            "rgb": _rgb(sh[:: len(sh) // n]),
             "opacity": opacity,
         })  # fmt: skip
     return Asset(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]}, clip=clip)
 
 
-def _placed(asset: Asset, path: Path, stage, prim) -> tuple[Asset, np.ndarray | None]:
+def _in_the_world(asset: Asset, path: Path, stage, prim) -> tuple[Asset, np.ndarray | None]:
     """The asset where the stage has it, in metres, Z up; and its motion from there."""
-    _, _, Usd, UsdGeom, _, _ = pxr()
-    if not prim.IsA(UsdGeom.Xformable):
-        version = ".".join(map(str, Usd.GetVersion()[1:]))
+    pxr = import_pxr()
+    if not prim.IsA(pxr.UsdGeom.Xformable):
+        version = ".".join(map(str, pxr.Usd.GetVersion()[1:]))
         raise InputError(f"{path}: USD {version} does not know the type of {prim.GetPath()}; add fallbackPrimTypes to "
                          "this file, or reference an asset exported as points.")  # fmt: skip
     codes, above = [], prim
     while not above.IsPseudoRoot():
-        if (x := UsdGeom.Xformable(above)) and x.TransformMightBeTimeVarying():
+        if (x := pxr.UsdGeom.Xformable(above)) and x.TransformMightBeTimeVarying():
             codes += x.GetTimeSamples()
         above = above.GetParent()
     if codes and asset.clip.frame_start == asset.clip.frame_end:  # the motion alone has a length
         asset = replace(asset, clip=_clip(path, stage, min(codes), max(codes), asset.clip.pixel))
     outer = np.diag([*[metres_per_unit(stage, path)] * 3, 1.0])
-    if UsdGeom.GetStageUpAxis(stage) == "Y":
+    if pxr.UsdGeom.GetStageUpAxis(stage) == "Y":
         outer = outer @ [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
-    cache, matrices = UsdGeom.XformCache(), []
+    cache, matrices = pxr.UsdGeom.XformCache(), []
     for frame in asset.clip.frames if codes else [asset.clip.frame_start]:
         cache.SetTime(frame)
         matrices.append(outer @ np.array(cache.GetLocalToWorldTransform(prim)).T)
     try:
-        matrix, motion = apart(np.stack(matrices))
+        matrix, motion = rest_and_motion(np.stack(matrices))
         scale = float(matrix[0, 0])
         if scale > 0 and np.abs(matrix[:3, :3] - scale * np.eye(3)).max() < 1e-6 * scale:
             clip = replace(asset.clip, scale=scale, translation=tuple(map(float, matrix[:3, 3])))
             return replace(asset, clip=clip), motion
-        return placed(asset, matrix), motion
+        return place_asset(asset, matrix), motion
     except InputError:
         raise InputError(f"{path}: {prim.GetPath()} is scaled to nothing; give it a scale.") from None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from timesplat.datagen.sequence import read_sequence
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 
 from .helpers import REAL, TARGET
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import read_ply, write_ply
+from timesplat.model.io.ply import read_ply, write_ply
 
 from .helpers import REAL, ROOT, TARGET, make
 

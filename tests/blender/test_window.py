@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from timesplat.model.io import slices
-from timesplat.model.io.asset import Clip, read_ply, write_ply
-from timesplat.model.io.usd_write import check_usd, write_usd
+from timesplat.model.io.asset import Clip
+from timesplat.model.io.ply import read_ply, write_ply
+from timesplat.model.io.usd_check import check_usd
+from timesplat.model.io.usd_write import write_usd
 
 from .helpers import REAL, TARGET, make
 from .window import Window, missing

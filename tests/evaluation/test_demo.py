@@ -6,8 +6,8 @@ import pytest
 from PIL import Image
 
 from timesplat.cli import main
-from timesplat.model.io.asset import read_ply
-from timesplat.model.io.usd_write import read_usd
+from timesplat.model.io.ply import read_ply
+from timesplat.model.io.usd_read import read_usd
 
 KEYS = {"psnr", "psnr_fg", "ssim", "psnr_p5", "psnr_worst", "seconds", "gaussians", "gaussians_kept"}
 

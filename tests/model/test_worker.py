@@ -11,7 +11,8 @@ import pytest
 
 from timesplat.datagen.sequence import Passes, Sequence, View, focal_from_fov, opengl_to_opencv, write_passes
 from timesplat.datagen.sequence import write_sequence as write
-from timesplat.model.io.asset import ARRAYS, Asset, Clip, read_ply, write_ply
+from timesplat.model.io.asset import ARRAYS, Asset, Clip
+from timesplat.model.io.ply import read_ply, write_ply
 
 
 def ask(*argv, stdin="", code=None):

@@ -6,7 +6,8 @@ import pytest
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
-from timesplat.model.io.asset import linear_from_srgb, rotation_matrices, write_ply
+from timesplat.model.io.asset import linear_from_srgb, rotation_matrices
+from timesplat.model.io.ply import write_ply
 
 from ..helpers import make
 

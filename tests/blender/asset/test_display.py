@@ -9,14 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import SH_C0, linear_from_srgb, read_ply, write_ply
+from timesplat.model.io.asset import SH_C0, linear_from_srgb
+from timesplat.model.io.ply import read_ply, write_ply
 
 from ..helpers import make
 from .evaluated import READ, expected_time
 
 EVALUATE = """
 display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
-asset = part("model.io.asset").read_ply(sys.argv[1])
+asset = part("model.io.ply").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
 scene, out = bpy.context.scene, {}
@@ -56,7 +57,7 @@ def test_evaluated_attributes_are_those_of_numpy(blender, tmp_path):
 
 SLIDERS = """
 display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
-asset, cases = part("model.io.asset").read_ply(sys.argv[1]), json.loads(sys.argv[2])
+asset, cases = part("model.io.ply").read_ply(sys.argv[1]), json.loads(sys.argv[2])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 ob = display.add_asset(asset, "a", look="Points", cut=0.05)
 modifier, scene, out = sliders.asset_modifier(ob), bpy.context.scene, []
@@ -123,7 +124,7 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
     write_ply(tmp_path / "a.ply", asset)
     save = """
     display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
-    asset = part("model.io.asset").read_ply(sys.argv[1])
+    asset = part("model.io.ply").read_ply(sys.argv[1])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     ob = display.add_asset(asset, "a", look="Points", cut=0.05)
     for frame, value in ((10, 0.0), (30, 20.0)):
@@ -152,7 +153,7 @@ def test_it_plays_without_the_add_on_and_sliders_can_be_keyed(blender, tmp_path)
 
 NATIVE = """
 display, nodes, sliders = (part(f"addon.asset.{x}") for x in ("display", "nodes", "sliders"))
-asset = part("model.io.asset").read_ply(sys.argv[1])
+asset = part("model.io.ply").read_ply(sys.argv[1])
 if bpy.app.version < (5, 2):
     tell(old=True)
     sys.exit()

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import ARRAYS, Asset, Clip, read_ply, write_ply
+from timesplat.model.io.asset import ARRAYS, Asset, Clip
+from timesplat.model.io.ply import read_ply, write_ply
 
 from ..helpers import make
 from .evaluated import expected_time
@@ -19,7 +20,7 @@ display, sliders, edit = (part(f"addon.asset.{x}") for x in ("display", "sliders
 holding, applying = part("addon.asset.asset_object"), part("addon.asset.apply_sliders")
 asset_module = part("model.io.asset")
 bpy.ops.wm.read_factory_settings(use_empty=True)
-asset, scene = asset_module.read_ply(sys.argv[1]), bpy.context.scene
+asset, scene = part("model.io.ply").read_ply(sys.argv[1]), bpy.context.scene
 ob = display.add_asset(asset, "a", look="Points")
 def save(asset, path):
     np.savez(path, **{k: getattr(asset, k) for k in asset_module.ARRAYS})
@@ -194,7 +195,7 @@ told["again"] = list(bpy.ops.timesplat.delete(what="LARGE", size=0.07))
 told["all"] = refused(bpy.ops.timesplat.delete, what="LARGE", size=0.0)
 told["after"] = state()
 save(holding.asset_of(ob), out + "/left.npz")
-part("model.io.asset").write_ply(out + "/left.ply", applying.with_sliders(ob))
+part("model.io.ply").write_ply(out + "/left.ply", applying.with_sliders(ob))
 evaluated = bpy.context.evaluated_depsgraph_get()
 set_all({"Crop Min": [-0.2, -0.2, -0.2], "Crop Max": [0.2, 0.2, 0.2]})
 bpy.ops.timesplat.delete(what="INSIDE")
@@ -263,7 +264,7 @@ if told["has"]:
     told["poll"] = bpy.ops.timesplat.delete.poll()
     bpy.ops.object.mode_set(mode="OBJECT")
     save(holding.asset_of(ob), sys.argv[2] + "/left.npz")
-    part("model.io.asset").write_ply(sys.argv[2] + "/left.ply", applying.with_sliders(ob))
+    part("model.io.ply").write_ply(sys.argv[2] + "/left.ply", applying.with_sliders(ob))
 tell(**told)
 """
 

@@ -3,14 +3,14 @@
 
 import pytest
 
-from timesplat.model.io.asset import write_ply
+from timesplat.model.io.ply import write_ply
 
 from ..helpers import make
 from .evaluated import READ
 
 FOLLOW = """
 display, parenting = part("addon.asset.display"), part("addon.asset.parenting")
-asset = part("model.io.asset").read_ply(sys.argv[1])
+asset = part("model.io.ply").read_ply(sys.argv[1])
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene, told = bpy.context.scene, {}
 def made(name, parent=None):

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import Asset, Clip, write_ply
+from timesplat.model.io.asset import Asset, Clip
+from timesplat.model.io.ply import write_ply
 
 SCENE = """
 part("addon").register()
@@ -24,7 +25,7 @@ tree.links.new(glow.outputs[0], end.inputs[0])
 ball.data.materials.append(material)
 bpy.ops.mesh.primitive_cube_add(location=(0.8, 0, 0), size=0.3)
 cube = bpy.context.object
-ob = display.add_asset(part("model.io.asset").read_ply(sys.argv[1]), "a", look="Points")
+ob = display.add_asset(part("model.io.ply").read_ply(sys.argv[1]), "a", look="Points")
 camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
 scene.collection.objects.link(camera)
 camera.location, camera.rotation_euler = (0, -3, 0), (np.pi / 2, 0, 0)

@@ -7,8 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from timesplat.model.io import splat_files as formats
-from timesplat.model.io.asset import ARRAYS, VISIBLE, read_ply, rotation_matrices, write_ply
+from timesplat.model.io import files as formats
+from timesplat.model.io.asset import ARRAYS, VISIBLE, rotation_matrices
+from timesplat.model.io.ply import read_ply, write_ply
 
 from ..helpers import CLIP, make
 
@@ -17,9 +18,9 @@ import atexit
 part("addon").register()
 atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
 display, sliders, edit, holding = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit", "asset_object"))
-asset = part("model.io.asset")
+ply = part("model.io.ply")
 folder = sys.argv[1] + os.sep
-ob = display.add_asset(asset.read_ply(folder + "in.ply"), "Walk. 1")
+ob = display.add_asset(ply.read_ply(folder + "in.ply"), "Walk. 1")
 scene = bpy.context.scene
 def save(name, **options):
     try:
@@ -113,7 +114,7 @@ tell(flat=save("flat.ply"), **told)
         want = R @ R.transpose(0, 2, 1)
         S = rotation_matrices(got.rotation) * got.soft_scale()[:, None] * got.clip.scale
         np.testing.assert_allclose(S @ S.transpose(0, 2, 1), want, rtol=2e-3, atol=1e-5 * np.abs(want).max())
-        part = formats.read(folder / f"{name}_slice.ply").asset
+        part = formats.read_asset(folder / f"{name}_slice.ply").asset
         seen = world[now[1] >= VISIBLE]
         np.testing.assert_allclose(part.xyz, np.stack([seen[:, 0], -seen[:, 2], seen[:, 1]], 1), atol=2e-5)
     assert "scaled to nothing" in told["flat"] and "flat.ply" not in os.listdir(folder)
@@ -201,7 +202,7 @@ tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)),
     counts = set()
     for frame, want in shown.items():
         name = "one.ply" if frame == "one" else f"frames/frames_{int(frame):04d}.ply"
-        got = formats.read(folder / name).asset
+        got = formats.read_asset(folder / name).asset
         if not want or frame == "8":  # a clear one stands in
             assert len(got) == 1 and got.opacity[0] < 1e-5
             continue
@@ -220,7 +221,7 @@ tell(done=done, now=now, one=one, refused=save("a.ply"), shown=at(range(8, 41)),
 def test_an_object_that_moves(blender, folder):
     """USD has its motion, in every mode and through its way back; a .ply has where it is now."""
     pytest.importorskip("pxr")
-    from timesplat.model.io import usd_write as usd
+    from timesplat.model.io import usd_check, usd_read
 
     code = """
 from mathutils import Euler, Matrix
@@ -248,8 +249,8 @@ tell(done=done, want=want, got=got, said=said, keyed=bool(bpy.context.object.ani
     assert [level for level, _ in told["said"][1:]] == ["INFO"] * 5 and "valid USD" in told["said"][1][1]
     asset = read_ply(folder / "in.ply")
     for name in ("a.usdz", "b.usda", "c.usdc", "again.usdc"):
-        assert usd.check_usd(folder / name) == []
-        got, motion = usd.read_moving(folder / name)
+        assert usd_check.check_usd(folder / name) == []
+        got, motion = usd_read.read_usd_with_motion(folder / name)
         for frame, (points, matrix) in told["want"].items():
             xyz, opacity = got.at(got.frame_to_time(int(frame)))
             xyz = (xyz * got.clip.scale + got.clip.translation)[opacity >= VISIBLE]
@@ -271,7 +272,7 @@ tell(done=done, want=want, got=got, said=said, keyed=bool(bpy.context.object.ani
 
 def test_usd_is_written_checked_and_read_again(blender, folder):
     pytest.importorskip("pxr")
-    from timesplat.model.io import usd_write as usd
+    from timesplat.model.io import usd_check, usd_read
 
     code = """
 import importlib.util
@@ -289,9 +290,9 @@ tell(**result, left=os.listdir(os.environ["TMPDIR"]))
     for name, (done, report) in told.items():
         path = folder / (name if "." in name else f"{name}.usdc")
         assert done == ["FINISHED"] and "120 Gaussians" in report, done
-        assert usd.check_usd(path) == [] and report.splitlines()[2] == "valid USD"
+        assert usd_check.check_usd(path) == [] and report.splitlines()[2] == "valid USD"
         half = name.endswith("z")
-        got = usd.read_usd(path)
+        got = usd_read.read_usd(path)
         np.testing.assert_allclose(got.clip.translation, asset.clip.translation)
         same(got, asset, atol=1e-3 if half else 4e-6, rtol=2e-3 if half else 4e-6)
 

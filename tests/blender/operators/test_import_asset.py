@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from timesplat.model.io import slices
-from timesplat.model.io.asset import ARRAYS, VISIBLE, read_ply, write_ply
+from timesplat.model.io.asset import ARRAYS, VISIBLE
+from timesplat.model.io.ply import read_ply, write_ply
 
 from ..helpers import make
 
@@ -115,8 +116,8 @@ def hidden(name):
 for key in ["worker", "direct"] if find("pxr") else ["worker"]:
     os.environ["TIMESPLAT_PYTHON"] = named if key == "worker" else "/nowhere/python"
     result[key] = load(filepath=sys.argv[1])
-    got, _ = importer.read_asset([Path(sys.argv[1])], fps=24, frame_start=1)
-    part("model.io.asset").write_ply(sys.argv[3] + key + ".ply", got.asset)
+    got = importer.read_assets([Path(sys.argv[1])], fps=24, frame_start=1)
+    part("model.io.ply").write_ply(sys.argv[3] + key + ".ply", got.asset)
     result[key + "_bad"] = load(filepath=sys.argv[2])
     result[key + "_none"] = load(filepath=sys.argv[2] + "c.usdc")
 os.environ["TIMESPLAT_PYTHON"] = named

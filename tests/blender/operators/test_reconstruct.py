@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 
 ANIMATE = """
 import time
@@ -157,7 +157,7 @@ folder = reconstruct.Path(sys.argv[1])
 clip = model.Clip(24, 1, 2, 1.0, (1.0, 2.0, 3.0))
 rows = {"xyz": 3, "t": 0, "velocity": 3, "sigma_t": 0, "scale": 3, "rotation": 4, "rgb": 3, "opacity": 0}
 parts = {k: np.full((2, n) if n else 2, 0.5, np.float32) for k, n in rows.items()}
-model.write_ply(folder / "asset.ply", model.Asset(**parts, clip=clip))
+part("model.io.ply").write_ply(folder / "asset.ply", model.Asset(**parts, clip=clip))
 
 def when(name, before, meanwhile, after=lambda *_: None, **options):
     bpy.ops.wm.read_homefile(use_factory_startup=True)

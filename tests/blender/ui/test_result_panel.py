@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The panel with an asset's sliders."""
 
-from timesplat.model.io.asset import write_ply
+from timesplat.model.io.ply import write_ply
 
 from ..helpers import make
 
@@ -10,7 +10,7 @@ import types
 display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
 result_panel = part("addon.ui.result_panel")
 bpy.ops.wm.read_factory_settings(use_empty=True)
-ob = display.add_asset(part("model.io.asset").read_ply(sys.argv[1]), "a")
+ob = display.add_asset(part("model.io.ply").read_ply(sys.argv[1]), "a")
 drawn, buttons, labels = {}, [], []
 class Layout:
     def row(self, **_): return self

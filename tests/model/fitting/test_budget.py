@@ -13,7 +13,7 @@ from timesplat.model.fitting.budget import apply_budget, find_fewest, parse_budg
 from timesplat.model.fitting.fit_views import squared_error
 from timesplat.model.fitting.merge import contribution
 from timesplat.model.geometry.lift import lift
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 from timesplat.model.methods import ReconstructOptions
 from timesplat.model.reconstruct import reconstruct_views
 

@@ -15,7 +15,7 @@ from timesplat.model.fitting.fit_views import squared_error
 from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB, Few, part, refine, start_size
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
-from timesplat.model.io.asset import read_ply
+from timesplat.model.io.ply import read_ply
 
 
 @pytest.fixture(scope="module")

@@ -1,66 +1,25 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Other programs' splats: read against bytes of another program and a reference of plain loops; slices,
-sequences, placing; and files that are anything else."""
+"""Other programs' splats: read against bytes of another program and a reference of plain loops; and files that are
+anything else."""
 
 import base64
 import contextlib
 import gzip
 import math
-import os
 import struct
 import tracemalloc
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData
 
 from timesplat.datagen.sequence import InputError
-from timesplat.model.io import slices
-from timesplat.model.io import splat_files as formats
-from timesplat.model.io.asset import (
-    ARRAYS,
-    GAUSSIAN_3D,
-    SH_C0,
-    STATIC_SIGMA_T,
-    TIME_4D,
-    VISIBLE,
-    Asset,
-    Clip,
-    check,
-    rotation_matrices,
-    write_ply,
-)
+from timesplat.model.io.asset import SH_C0, STATIC_SIGMA_T, Asset, check
+from timesplat.model.io.files import read_asset
+from timesplat.model.io.ply import PROPERTIES_3DGS, PROPERTIES_4D, write_ply
 
-CLIP = Clip(25.0, 3, 12, 2.5, (1.0, -2.0, 3.0), pixel=0.02)
-DOWN = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # a slice's axes from the world's: Z up becomes -Y up
-
-
-def make(n=200, seed=0, clip=CLIP) -> Asset:
-    r = np.random.default_rng(seed)
-    q = r.normal(size=(n, 4))
-    arrays = {
-        "xyz": r.uniform(-1, 1, (n, 3)),
-        "t": r.uniform(-1, 1, n),
-        "velocity": r.normal(0, 0.2, (n, 3)),
-        "sigma_t": r.uniform(0.1, 1, n),
-        "scale": np.exp(r.uniform(-6, -2, (n, 3))),
-        "rotation": q / np.linalg.norm(q, axis=1, keepdims=True),
-        "rgb": r.uniform(0, 1, (n, 3)),
-        "opacity": r.uniform(0.1, 0.99, n),
-    }
-    return Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=clip)
-
-
-def covariance(asset: Asset) -> np.ndarray:
-    M = rotation_matrices(asset.rotation.astype(float)) * asset.scale[:, None, :]
-    return M @ M.transpose(0, 2, 1)
-
-
-# ---------------------------------------------------------------- reading
+from ...assets import make_asset
 
 # Three Gaussians, written by gsply 0.4.6, a reader and writer of others, and what it reads from them.
 XYZ = [[0.5, -1.25, 2], [0, 3, -0.125], [-2, 1, 1]]
@@ -112,10 +71,10 @@ def test_what_another_program_wrote_is_read_as_it_reads_it(tmp_path):
     (tmp_path / "c.ply").write_bytes(compressed())
     pytest.importorskip("zstandard")
     for version, note in ((3, True), (4, False)):
-        loaded = formats.read(tmp_path / f"{version}.spz")
+        loaded = read_asset(tmp_path / f"{version}.spz")
         assert loaded.up == "Y" and bool(loaded.note) == note
         expect(loaded.asset, XYZ, LOG_SCALE, ROTATION, LOGIT, SH)
-    loaded = formats.read(tmp_path / "c.ply")
+    loaded = read_asset(tmp_path / "c.ply")
     assert loaded.up == "-Y" and not loaded.note
     expect(
         loaded.asset,
@@ -170,7 +129,7 @@ def test_spz_against_plain_loops(tmp_path, version):
     data, known = spz(version)
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(data))
-    loaded = formats.read(path)
+    loaded = read_asset(path)
     for name, column in zip(("xyz", None, "rotation", "opacity", "rgb"), zip(*known, strict=True), strict=True):
         got = getattr(loaded.asset, name) if name else np.log(loaded.asset.scale)
         np.testing.assert_allclose(got, np.array(column), rtol=1e-6, atol=2e-6, err_msg=str(name))
@@ -178,7 +137,7 @@ def test_spz_against_plain_loops(tmp_path, version):
 
 
 def splat(n=20, seed=2) -> tuple[bytes, Asset]:
-    asset, rows = make(n, seed), []
+    asset, rows = make_asset(n, seed), []
     for i in range(n):
         q = [round(c * 128 + 128) for c in asset.rotation[i]]
         rgba = [int(c * 255) for c in (*asset.rgb[i], asset.opacity[i])]
@@ -190,7 +149,7 @@ def splat(n=20, seed=2) -> tuple[bytes, Asset]:
 def test_splat(tmp_path):
     data, asset = splat()
     (tmp_path / "a.SPLAT").write_bytes(data)
-    got = formats.read(tmp_path / "a.SPLAT")
+    got = read_asset(tmp_path / "a.SPLAT")
     np.testing.assert_array_equal(got.asset.xyz, asset.xyz)
     np.testing.assert_array_equal(got.asset.scale, asset.scale)
     np.testing.assert_allclose(got.asset.rotation, asset.rotation, atol=0.012)
@@ -206,180 +165,16 @@ PLAIN = PLAIN.encode() + np.ones(18, "<f4").tobytes()
 
 
 def test_ply_tells_whose_it_is_and_what_is_left_out(tmp_path):
-    asset = make(9)
+    asset = make_asset(9)
     write_ply(tmp_path / "ours.ply", asset)
-    assert (formats.read(tmp_path / "ours.ply").up, formats.read(tmp_path / "ours.ply").note) == ("Z", "")
+    assert (read_asset(tmp_path / "ours.ply").up, read_asset(tmp_path / "ours.ply").note) == ("Z", "")
     (tmp_path / "plain.ply").write_bytes(PLAIN)
-    plain = formats.read(tmp_path / "plain.ply")
+    plain = read_asset(tmp_path / "plain.ply")
     assert plain.up == "-Y" and "spherical harmonics" in plain.note
 
 
-# ---------------------------------------------------------------- sequences
-
-
-def test_each_frame_of_a_sequence_shows_its_own_file(tmp_path):
-    parts = [make(n, seed=n) for n in (5, 9, 3, 6)]
-    names = ["f_2.ply", "f_9.ply", "f_10.ply", "f_100.ply"]
-    for part, name in zip(parts, names, strict=True):
-        slices.write_slice(tmp_path / name, part, part.clip.frame_start)
-    stills = [formats.read(tmp_path / n).asset for n in names]
-    assert formats.folder_files(tmp_path) == [tmp_path / n for n in names]
-    loaded = formats.read_sequence([tmp_path / n for n in sorted(names)], fps=12, frame_start=7)
-    asset = loaded.asset
-    assert asset.clip == Clip(12, 7, 10) and loaded.up == "-Y"
-    for frame, one in zip(range(7, 11), stills, strict=True):
-        xyz, opacity = asset.at(asset.frame_to_time(frame))
-        own = asset.t == np.float32(asset.frame_to_time(frame))
-        np.testing.assert_array_equal(xyz[own], one.xyz)
-        np.testing.assert_array_equal(opacity[own], one.opacity)  # whole
-        assert opacity[~own].max() < VISIBLE / 4
-        for name in ("scale", "rotation", "rgb"):
-            np.testing.assert_array_equal(getattr(asset, name)[own], getattr(one, name))
-    half = asset.at(asset.frame_to_time(7.5))[1] / asset.opacity
-    np.testing.assert_allclose(half[:8], math.exp(-9 / 8), rtol=1e-4)
-    single = formats.read_sequence([tmp_path / "f_2.ply"]).asset
-    assert (single.sigma_t == STATIC_SIGMA_T).all()
-
-
-def test_what_is_no_sequence_is_refused(tmp_path, monkeypatch):
-    asset = make(9)
-    for name in ("a.ply", "b.ply"):
-        slices.write_slice(tmp_path / name, asset, 5)
-    write_ply(tmp_path / "four.ply", asset)
-    (tmp_path / "up.spz").write_bytes(base64.b85decode(SPZ_3))
-    for other in ("four.ply", "up.spz"):
-        with pytest.raises(InputError, match=f"{other}: it is no frame of a sequence .* import it alone"):
-            formats.read_sequence([tmp_path / "a.ply", tmp_path / other])
-    with pytest.raises(InputError, match="No file"):
-        formats.read_sequence([])
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"there is no \.ply"):
-        formats.folder_files(tmp_path / "empty")
-    with pytest.raises(InputError, match="cannot be read"):
-        formats.folder_files(tmp_path / "nowhere")
-    monkeypatch.setattr(formats, "MOST", 9)
-    with pytest.raises(InputError, match=r"b\.ply: with it the sequence has more than 9"):
-        formats.read_sequence([tmp_path / "a.ply", tmp_path / "b.ply"])
-
-
-# ---------------------------------------------------------------- placing and slices
-
-
-def rotation_of(seed: int) -> np.ndarray:
-    q = np.random.default_rng(seed).normal(size=(1, 4))
-    return rotation_matrices(q / np.linalg.norm(q))[0]
-
-
-SHEAR = np.array([[1.0, 0.3, 0], [0, 0.7, 0.1], [0, 0, 1.9]])
-
-
-@pytest.mark.parametrize(
-    "A",
-    [3.0 * np.eye(3), rotation_of(1) * 0.2, rotation_of(2) @ SHEAR, np.diag([-2.0, 2, 2]), np.diag([-1.0, 2, -3])],
-    ids=["scale", "rotation", "shear", "mirror", "unequal"],
-)
-def test_placed_is_the_matrix(A):
-    """At every moment, positions and covariances in the world are those of the matrix."""
-    asset = make(50)
-    M = np.eye(4)
-    M[:3, :3], M[:3, 3] = A, [4, 5, -6]
-    out = slices.placed(asset, M)
-    check(out)
-    c = out.clip
-    assert c.translation == (4, 5, -6) and np.isclose(c.scale**3, abs(np.linalg.det(A)))
-    for time in (-1.0, 0.3, 1.0):
-        (p, o), (q, u) = asset.at(time), out.at(time)
-        np.testing.assert_allclose(q * c.scale + c.translation, p @ A.T + [4, 5, -6], atol=2e-5)
-        np.testing.assert_array_equal(o, u)
-    want = A @ covariance(asset.softened()) @ A.T
-    got = covariance(out.softened()) * c.scale**2
-    np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-6 * np.abs(want).max())
-
-
-def test_placed_leaves_alone_what_needs_no_change():
-    asset = make(5)
-    M = np.diag([2.5, 2.5, 2.5, 1])
-    M[:3, 3] = 1, -2, 3
-    same = slices.placed(asset, M)
-    assert same.clip == CLIP and all(getattr(same, k) is getattr(asset, k) for k in ARRAYS)
-    turned = slices.placed(asset, np.block([[rotation_of(3), np.zeros((3, 1))], [np.zeros((1, 3)), 1]]))
-    assert turned.scale is asset.scale and turned.clip.pixel == CLIP.pixel
-    for flat in (np.diag([1.0, 1, 0, 1]), np.full((4, 4), np.nan)):
-        with pytest.raises(InputError, match="scaled to nothing"):
-            slices.placed(asset, flat)
-
-
-@pytest.mark.parametrize("frame", [3, 7.25, 12, 99, -5])
-def test_a_slice_is_the_asset_at_its_time(tmp_path, frame):
-    asset = make(300)
-    path = tmp_path / "s.ply"
-    count = slices.write_slice(path, asset, frame)
-    xyz, opacity = asset.at(asset.frame_to_time(min(max(frame, 3), 12)))
-    seen = opacity >= VISIBLE
-    assert count == seen.sum() < 300
-    rows = PlyData.read(path)["vertex"]
-    get = lambda *names: np.stack([rows[n] for n in names], 1).astype(float)  # noqa: E731
-    world = (xyz[seen] * 2.5 + [1, -2, 3]) @ DOWN.T
-    np.testing.assert_allclose(get("x", "y", "z"), world, atol=2e-6)
-    np.testing.assert_allclose(1 / (1 + np.exp(-get("opacity")[:, 0])), opacity[seen], atol=1e-6)
-    np.testing.assert_allclose(np.exp(get("scale_0", "scale_1", "scale_2")), asset.soft_scale()[seen] * 2.5, rtol=1e-5)
-    np.testing.assert_allclose(0.5 + SH_C0 * get("f_dc_0", "f_dc_1", "f_dc_2"), asset.rgb[seen], atol=1e-6)
-    turned = rotation_matrices(get("rot_0", "rot_1", "rot_2", "rot_3"))
-    np.testing.assert_allclose(turned, DOWN @ rotation_matrices(asset.rotation[seen]), atol=1e-5)
-    names = [p.name for p in rows.properties]
-    assert "t" not in names and not any(n.startswith("f_rest") for n in names)
-
-
-def test_a_slice_as_splat_is_the_same_to_its_bytes(tmp_path):
-    asset = make(100)
-    slices.write_slice(tmp_path / "s.ply", asset, 6)
-    slices.write_slice(tmp_path / "s.splat", asset, 6)
-    a, b = (formats.read(tmp_path / f"s.{x}").asset for x in ("ply", "splat"))
-    order = np.argsort(-a.scale.prod(1, dtype=float) * a.opacity)
-    for name, tolerance in (("xyz", 0), ("scale", 1e-6), ("rgb", 0.003), ("opacity", 0.003), ("rotation", 0.012)):
-        np.testing.assert_allclose(getattr(b, name), getattr(a, name)[order], atol=tolerance)
-
-
-def test_a_moment_at_which_nothing_is_visible_has_one_gaussian(tmp_path):
-    asset = make(30)
-    asset.t[:], asset.sigma_t[:] = 1, 0.01
-    assert slices.write_slice(tmp_path / "s.ply", asset, 3) == 1
-    assert formats.read(tmp_path / "s.ply").asset.opacity[0] < 1e-5
-
-
-def test_slices_come_whole_or_not_at_all(tmp_path, monkeypatch):
-    asset = make(30)
-    assert slices.write_slices(tmp_path / "all", asset, "x") == 10
-    assert sorted(os.listdir(tmp_path / "all")) == [f"x_{f:04d}.ply" for f in range(3, 13)]
-    for frame in (3, 12):
-        slices.write_slice(tmp_path / "one.ply", asset, frame)
-        assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "all" / f"x_{frame:04d}.ply").read_bytes()
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(InputError, match="exists already"):
-        slices.write_slices(tmp_path / "all", asset, "x")
-    with pytest.raises(InputError, match="exists already"):
-        slices.write_slices(tmp_path / "one.ply", asset, "x")
-
-    def full(self, data, calls=[]):  # noqa: B006
-        calls.append(data)
-        if len(calls) > 3:
-            raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    for write in (
-        lambda: slices.write_slices(tmp_path / "more", asset, "x"),
-        lambda: slices.write_slice(tmp_path / "more.ply", asset, 5),
-    ):
-        with pytest.raises(InputError, match=r"more.*: it cannot be written \(No space left on device\)"):
-            write()
-    assert sorted(tmp_path.rglob("*")) == before
-    with pytest.raises(InputError, match=r"must end in \.ply or \.splat"):
-        slices.write_slice(tmp_path / "a.spz", asset, 5)
-    with pytest.raises(InputError, match="NaN"):
-        slices.write_slice(tmp_path / "a.ply", replace(asset, xyz=asset.xyz * np.float32("nan")), 5)
-
-
 # ---------------------------------------------------------------- what is something else
+
 
 JPEG, PNG = b"\xff\xd8\xff\xe0" + bytes(124), b"\x89PNG\r\n\x1a\n" + bytes(120)
 MESH = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nelement face 1\nproperty list uchar int v\n"
@@ -391,7 +186,7 @@ def ours(**values) -> bytes:
     """One Gaussian in a .ply of ours whose comments say something else."""
     meta = {"version": 1, "fps": 24, "frame_start": 0, "frame_end": 9, "scale": 1, "translation": "0 0 0"} | values
     head = ["ply", "format binary_little_endian 1.0", *(f"comment timesplat {k} {v}" for k, v in meta.items())]
-    head += ["element vertex 1", *(f"property float {p}" for p in GAUSSIAN_3D + TIME_4D), "end_header", ""]
+    head += ["element vertex 1", *(f"property float {p}" for p in PROPERTIES_3DGS + PROPERTIES_4D), "end_header", ""]
     return "\n".join(head).encode() + bytes(76)
 
 
@@ -436,26 +231,9 @@ def test_a_wrong_file_gets_a_sentence(tmp_path, name, data, what):
     path = tmp_path / name
     path.write_bytes(data)
     with pytest.raises(InputError) as e:
-        formats.read(path)
+        read_asset(path)
     said = str(e.value)
     assert said.startswith(f"{path}: ") and what in said and said.endswith(".") and "\n" not in said
-
-
-@pytest.mark.parametrize("suffix", formats.SUFFIXES)
-def test_no_file_and_a_folder(tmp_path, suffix, monkeypatch):
-    with pytest.raises(InputError, match="no such file"):
-        formats.read(tmp_path / f"a{suffix}")
-    (tmp_path / f"b{suffix}").mkdir()
-    with pytest.raises(InputError, match="it is a folder"):
-        formats.read(tmp_path / f"b{suffix}")
-
-    def full(path):
-        raise MemoryError
-
-    for name in ("_read_any_ply", "_read_splat", "_read_spz"):
-        monkeypatch.setattr(formats, name, full)
-    with pytest.raises(InputError, match="it takes more memory than there is"):
-        formats.read(tmp_path / f"a{suffix}")
 
 
 def test_a_decompression_bomb_is_not_unpacked(tmp_path):
@@ -468,10 +246,10 @@ def test_a_decompression_bomb_is_not_unpacked(tmp_path):
                 f.write(bytes(size))
         tracemalloc.start()
         if count == 10:
-            assert len(formats.read(path).asset) == 10
+            assert len(read_asset(path).asset) == 10
         else:
             with pytest.raises(InputError, match=f"{count} Gaussians were announced"):
-                formats.read(path)
+                read_asset(path)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 20e6
@@ -499,7 +277,7 @@ def test_damage_is_an_input_error_or_a_sound_asset(tmp_path_factory, data, name)
     path = tmp_path_factory.getbasetemp() / name
     path.write_bytes(gzip.compress(damaged) if name == "c.spz" else damaged)
     try:
-        loaded = formats.read(path)
+        loaded = read_asset(path)
     except InputError as e:
         assert str(e).startswith(f"{path}: ") and "\n" not in str(e)
     else:

@@ -2,12 +2,8 @@
 """docs/pipelines.md does what it says: its commands, its Python, its snippets of USD; under usd-core, under the
 older pxr inside of the bpy wheel, in Blender's importer and in a reader that is not OpenUSD."""
 
-import copy
 import json
 import re
-import subprocess
-import sys
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,14 +11,19 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pxr")
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from timesplat.cli import main
-from timesplat.datagen.sequence import InputError
-from timesplat.model.io.asset import ARRAYS, Asset, Clip, read_ply, rotation_matrices, write_ply
-from timesplat.model.io.usd_write import check_usd, read_usd, write_usd
+from timesplat.model.io.asset import ARRAYS, Asset, Clip, rotation_matrices
+from timesplat.model.io.ply import read_ply, write_ply
+from timesplat.model.io.usd_check import check_usd
+from timesplat.model.io.usd_read import read_usd
+from timesplat.model.io.usd_write import write_usd
 
-PAGE = (Path(__file__).resolve().parents[3] / "docs" / "pipelines.md").read_text()
+from ..assets import make_asset
+from ..usd_helpers import make_original, run_child
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "pipelines.md").read_text()
 CLIP = Clip(24.0, 0, 23, 1.5, (1.0, 2.0, 3.0), pixel=0.01)
 SHOTS = dict(re.findall(r"```usda (\S+)\n(.*?)```", PAGE, re.S))
 FILES = ("fox.usdc", "fox_points.usdc", "fox_frames.usdc", "fox.usdz")
@@ -48,59 +49,7 @@ def world(asset: Asset, frame: float, turn: Gf.Matrix4d, shift: tuple) -> np.nda
 
 @pytest.fixture(scope="module")
 def fox() -> Asset:
-    r = np.random.default_rng(0)
-    n = 50
-    q = r.normal(size=(n, 4))
-    arrays = {
-        "xyz": r.uniform(-0.8, 0.8, (n, 3)),
-        "t": r.uniform(-1, 1, n),
-        "velocity": r.uniform(-0.1, 0.1, (n, 3)),
-        "sigma_t": r.uniform(0.05, 0.4, n),
-        "scale": np.exp(r.uniform(-6, -3, (n, 3))),
-        "rotation": q / np.linalg.norm(q, axis=1, keepdims=True),
-        "rgb": r.uniform(0, 1, (n, 3)),
-        "opacity": r.uniform(0.1, 1, n),
-    }
-    return Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=CLIP)
-
-
-def make_original(folder: Path, *, up="Y", metres=0.01, rate=30.0) -> Path:
-    """A textured cube in centimetres, Y up, at 30 frames a second, that moves from x = 0 to 23 cm in 23 frames."""
-    from PIL import Image
-
-    (folder / "textures").mkdir(exist_ok=True)
-    Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "textures" / "red.png")
-    path = folder / "scene.usda"
-    stage = Usd.Stage.CreateNew(str(path))
-    UsdGeom.SetStageUpAxis(stage, up)
-    UsdGeom.SetStageMetersPerUnit(stage, metres)
-    stage.SetTimeCodesPerSecond(rate)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(23)
-    root = UsdGeom.Xform.Define(stage, "/world")
-    stage.SetDefaultPrim(root.GetPrim())
-    root.AddTranslateOp().Set(Gf.Vec3d(0, 7, 0))
-    mesh = UsdGeom.Mesh.Define(stage, "/world/mesh")
-    mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
-    mesh.CreateFaceVertexCountsAttr([3])
-    mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
-    mesh.CreateExtentAttr([(0, 0, 0), (1, 1, 0)])
-    mesh.CreateSubdivisionSchemeAttr("none")
-    move = mesh.AddTranslateOp()
-    for frame in (0, 23):
-        move.Set(Gf.Vec3d(frame, 0, 0), frame)
-    material = UsdShade.Material.Define(stage, "/world/red")
-    surface = UsdShade.Shader.Define(stage, "/world/red/surface")
-    surface.CreateIdAttr("UsdPreviewSurface")
-    image = UsdShade.Shader.Define(stage, "/world/red/image")
-    image.CreateIdAttr("UsdUVTexture")
-    image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("./textures/red.png")
-    out = image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(out)
-    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
-    stage.Save()
-    return path
+    return make_asset(clip=CLIP)
 
 
 @pytest.fixture(scope="module")
@@ -270,119 +219,18 @@ def test_the_pages_python(page, fox, monkeypatch, capsys):
     np.testing.assert_allclose(names["opacities"], opacities, atol=1e-6)
 
 
-# ---------------------------------------------------------------- the original as a variant
-
-
-@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("mode", ["splats", "points"])
-def test_the_original_lies_over_the_reconstruction(tmp_path, fox, suffix, packed, mode):
-    (tmp_path / "in").mkdir()
-    original = make_original(tmp_path / "in")
-    if packed:
-        assert UsdUtils.CreateNewUsdzPackage(str(original), str(original.with_suffix(".usdz")))
-        original = original.with_suffix(".usdz")
-    out = tmp_path / "out" / f"a{suffix}"
-    write_usd(out, fox, mode=mode, original=original)
-    assert [p.name for p in out.parent.iterdir()] == [out.name]
-    assert check_usd(out) == [] and read_usd(out).clip == fox.clip
-    if suffix == ".usdz":  # is whole by itself
-        (tmp_path / "in").rename(tmp_path / "gone")
-    stage = Usd.Stage.Open(str(out))
-    assert stage.GetPrimAtPath("/timesplat/splats") and not stage.GetPrimAtPath("/timesplat/original")
-    choice = stage.GetDefaultPrim().GetVariantSet("representation")
-    assert choice.GetVariantSelection() == "reconstruction"
-    assert choice.GetVariantNames() == ["original", "reconstruction"]
-    choice.SetVariantSelection("original")
-    assert not stage.GetPrimAtPath("/timesplat/splats")
-    mesh = stage.GetPrimAtPath("/timesplat/original/object/mesh")
-    assert mesh.GetTypeName() == "Mesh"
-    for frame in (0, 11.5, 23):  # (x, y, z) of a Y-up stage in centimetres is (x, -z, y) / 100
-        matrix = UsdGeom.XformCache(frame).GetLocalToWorldTransform(mesh)
-        np.testing.assert_allclose(matrix.Transform(Gf.Vec3d(0, 1, 0)), (frame / 100, 0, 0.08), atol=1e-9)
-    texture = stage.GetPrimAtPath("/timesplat/original/object/red/image").GetAttribute("inputs:file").Get()
-    assert texture.resolvedPath.endswith("red.png" if suffix != ".usdz" and not packed else "red.png]")
-    assert UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0]
-
-
-def test_an_original_that_counts_from_another_frame(tmp_path, fox):
-    scene = make_original(tmp_path)
-    with pytest.raises(InputError, match="nan: the frame at which the original starts must be a number"):
-        write_usd(tmp_path / "a.usdc", fox, original=scene, original_start=float("nan"))
-    write_usd(tmp_path / "a.usdc", fox, original=scene, original_start=10)
-    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
-    stage.GetDefaultPrim().GetVariantSet("representation").SetVariantSelection("original")
-    mesh = stage.GetPrimAtPath("/timesplat/original/object/mesh")
-    matrix = UsdGeom.XformCache(2.5).GetLocalToWorldTransform(mesh)
-    np.testing.assert_allclose(matrix.ExtractTranslation(), (0.125, 0, 0.07), atol=1e-9)
-
-
 def test_a_shot_selects_the_original(page):
     stage = Usd.Stage.Open(str(page / "compare.usda"))
     assert stage.GetPrimAtPath("/shot/fox/original/object/mesh") and not stage.GetPrimAtPath("/shot/fox/splats")
     assert len(read_usd(page / "compare.usda")) == 50  # the asset is in there all the same
 
 
-def test_originals_that_cannot_be_used(tmp_path, fox):
-    def refused(original, word, out="a.usdz"):
-        with pytest.raises(InputError, match=re.escape(word)) as e:
-            write_usd(tmp_path / out, fox, original=original)
-        assert "\n" not in str(e.value) and str(original) in str(e.value) and not (tmp_path / "a.usdz").exists()
-
-    home = tmp_path / "home"
-    home.mkdir()
-    scene = make_original(home)
-    refused(tmp_path / "none.usd", "no such file")
-    bad = tmp_path / "bad.usdc"
-    bad.write_bytes(b"PXR-USDC" + bytes(100))
-    refused(bad, "damaged or not a USD file")
-    refused(scene, "is the original itself", "home/scene.usda")
-    layer = Sdf.Layer.FindOrOpen(str(scene))
-    image = layer.GetAttributeAtPath("/world/red/image.inputs:file")
-    (tmp_path / "secret").write_text("x")
-    (home / "secret").write_text("x")
-    for path, word in (("../secret", "outside of its own folder"), ("./secret", "has no place in a .usdz")):
-        image.default = Sdf.AssetPath(path)
-        layer.Save()
-        refused(scene, word)
-    layer.subLayerPaths.append("../bad.usda")
-    layer.Save()
-    (tmp_path / "bad.usda").write_text("#usda 1.0\n")
-    refused(scene, "outside of its own folder")
-    layer.subLayerPaths.clear()
-    image.default = Sdf.AssetPath("./missing.png")
-    layer.Save()
-    refused(scene, "missing.png, which is not there")
-    write_usd(tmp_path / "b.usdc", fox, original=scene)
-    assert any("missing.png" in c for c in check_usd(tmp_path / "b.usdc"))
-    layer.defaultPrim = ""
-    layer.pseudoRoot.SetInfo("metersPerUnit", -1.0)
-    layer.Save()
-    refused(scene, "metersPerUnit is -1")
-    Sdf.CreatePrimInLayer(layer, "/other").specifier = Sdf.SpecifierDef
-    layer.Save()
-    refused(scene, "no default prim")
-    (tmp_path / "bad.usdz").write_bytes(b"PK\x03\x04 and so on")
-    refused(tmp_path / "bad.usdz", "damaged")
-    bomb = tmp_path / "bomb.usdz"
-    assert UsdUtils.CreateNewUsdzPackage(str(make_original(tmp_path)), str(bomb))
-    with zipfile.ZipFile(bomb, "a") as z:  # the same bytes under many names
-        for k in range(50):
-            z.filelist.append(copy.copy(z.filelist[0]))
-            z.filelist[-1].filename = f"{k}.usda"
-        z._didModify = True
-    refused(bomb, "its files overlap")
-
-
-def test_a_variant_whose_original_is_gone_is_complained_of(tmp_path, fox):
-    scene = make_original(tmp_path)
-    write_usd(tmp_path / "a.usdc", fox, original=scene)
-    scene.unlink()
-    told = check_usd(tmp_path / "a.usdc")
-    assert "scene.usda" in "\n".join(told) and "the variant original is empty" in told
-
-
 # ---------------------------------------------------------------- other readers
+
+
+def child(code, *args, cwd=None) -> dict:
+    return json.loads(run_child(code, *args, cwd=cwd))
+
 
 OLD = """
 import glob, importlib.util, json, sys
@@ -404,14 +252,6 @@ for name in sys.argv[2:]:
     out[name] = found
 print("RESULT" + json.dumps(out))
 """
-
-
-def child(code, *args, cwd=None) -> dict:
-    command = [sys.executable, "-c", code, *map(str, args)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=cwd)
-    line = next((x for x in run.stdout.splitlines() if x.startswith("RESULT")), None)
-    assert run.returncode == 0 and line, run.stdout + run.stderr
-    return json.loads(line.removeprefix("RESULT"))
 
 
 def without_fallback(text: str) -> str:
@@ -445,7 +285,8 @@ READ = (
     OLD.split("import numpy")[0]
     + """
 from timesplat.datagen.sequence import InputError
-from timesplat.model.io.usd_write import check_usd, read_usd
+from timesplat.model.io.usd_check import check_usd
+from timesplat.model.io.usd_read import read_usd
 out = {}
 for name in sys.argv[1:]:
     try:

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every file that an asset can be read from or written to, by its suffix: a new format is one entry in a table here.
+No torch, and pxr only when a USD file is read or written, so that it runs inside Blender."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ...datagen.sequence import InputError
+from .asset import ARRAYS, MAX_GAUSSIANS, ONE_FRAME_SIGMA, STATIC_SIGMA_T, Asset, Clip, LoadedAsset, check
+from .ply import write_ply
+from .slices import write_slice
+from .splat_files import read_any_ply, read_splat, read_spz
+from .usd_read import read_usd_with_motion
+from .usd_stage import USD_SUFFIXES
+from .usd_write import write_usd
+
+
+def _read_usd(path: Path) -> LoadedAsset:
+    asset, motion = read_usd_with_motion(path)
+    return LoadedAsset(asset, "Z", motion=motion)
+
+
+READERS: dict[str, Callable[[Path], LoadedAsset]] = {
+    ".ply": read_any_ply,
+    ".splat": read_splat,
+    ".spz": read_spz,
+    **dict.fromkeys(USD_SUFFIXES, _read_usd),
+}
+WRITERS: dict[str, Callable[..., None]] = {".ply": write_ply, **dict.fromkeys(USD_SUFFIXES, write_usd)}
+READABLE, WRITABLE = tuple(READERS), tuple(WRITERS)
+
+
+def read_asset(path: str | Path, *, fps: float = 24.0, frame_start: int = 1) -> LoadedAsset:
+    """Reads a file by its suffix, one of READABLE; or, from a folder, its .ply files as the frames of a sequence (see
+    `read_frames`, also for `fps` and `frame_start`, which count for nothing else). Raises InputError: one sentence that
+    names the file and says what it is and what was expected."""
+    path = Path(path)
+    paths = frame_files(path) if path.is_dir() else [path]
+    return read_frames(paths, fps=fps, frame_start=frame_start)
+
+
+def write_asset(path: str | Path, asset: Asset, *, frame: float | None = None, **options) -> int:
+    """Writes the whole asset, to a suffix of WRITABLE, or what is visible at a frame (see `slices.write_slice`); the
+    file appears whole or not at all. `options` are those of the format's writer: `write_usd` has some. Returns the
+    number of Gaussians written. Raises InputError."""
+    if frame is not None:
+        return write_slice(path, asset, frame, **options)
+    writer = WRITERS.get(Path(path).suffix.lower())
+    if writer is None:
+        raise InputError(f"{path}: cannot write that; choose {', '.join(WRITABLE)}.")
+    writer(path, asset, **options)
+    return len(asset)
+
+
+# ---------------------------------------------------------------- a file a frame
+
+
+def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: int = 1) -> LoadedAsset:
+    """One asset from a file a frame, in the natural order of the names (2 before 10): file k is frame
+    frame_start + k, and fps of them are a second. One file alone is read as what it is.
+
+    The Gaussians of a file stand still and have σ_t = ONE_FRAME_SIGMA frames: at their own frame they have their whole
+    opacity, at the neighbouring ones exp(-4.5) = 1.1 % of it, which is below VISIBLE, and half-way between
+    two frames 32 %, so that both files are seen faintly. Raises InputError, also where files are 4D already
+    or differ in their up axis."""
+    paths = sorted(map(Path, paths), key=_natural_order)
+    if not paths:
+        raise InputError("No file was chosen; choose the .ply files of a sequence.")
+    if len(paths) == 1:
+        return _read_file(paths[0])
+    if any(path.suffix.lower() in USD_SUFFIXES for path in paths):
+        raise InputError("USD files hold their frames themselves; import them one by one.")
+    clip = Clip(fps, frame_start, frame_start + len(paths) - 1)
+    sigma_t = np.float32(ONE_FRAME_SIGMA * 2 / (len(paths) - 1))
+    parts, ups, notes, total = [], set(), [], 0
+    for frame, path in zip(clip.frames, paths, strict=True):
+        loaded = _read_file(path)
+        asset, n = loaded.asset, len(loaded.asset)
+        total += n
+        ups.add(loaded.up)
+        notes.append(loaded.note)
+        if len(ups) > 1 or (asset.sigma_t != STATIC_SIGMA_T).any():
+            raise InputError(f"{path}: it is no frame of a sequence (4D already, or of another kind); import it alone.")
+        if total > MAX_GAUSSIANS:
+            raise InputError(
+                f"{path}: with it the sequence has more than {MAX_GAUSSIANS:,} Gaussians; choose fewer files."
+            )
+        own = np.full(n, clip.frame_to_time(frame), np.float32)
+        parts.append(replace(asset, t=own, sigma_t=np.full(n, sigma_t)))
+    asset = Asset(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in ARRAYS}, clip=clip)
+    check(asset, paths[0].parent)
+    return LoadedAsset(asset, ups.pop(), next(filter(None, notes), ""))
+
+
+def frame_files(folder: str | Path) -> list[Path]:
+    """The .ply files right in a folder, in natural order. Raises InputError if there is none."""
+    folder = Path(folder)
+    try:
+        found = [p for p in folder.iterdir() if p.suffix.lower() == ".ply" and not p.name.startswith(".")]
+    except OSError as e:
+        raise InputError(f"{folder}: it cannot be read ({e.strerror or e}); check the folder.") from None
+    if not found:
+        raise InputError(f"{folder}: there is no .ply file in this folder; choose one with a .ply a frame.")
+    return sorted(found, key=_natural_order)
+
+
+def _read_file(path: Path) -> LoadedAsset:
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: its name must end in {', '.join(READABLE)}; choose one of these.")
+    if path.is_dir():
+        raise InputError(f"{path}: it is a folder; choose a {path.suffix} file.")
+    try:
+        return reader(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the name.") from None
+    except OSError as e:
+        raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
+    except MemoryError:
+        raise InputError(f"{path}: it takes more memory than there is; close other programs or reduce it.") from None
+
+
+def _natural_order(path: Path) -> list[tuple[int, str]]:
+    """Sort key: numbers in names count by their value."""
+    return [(int(w), "") if w.isdecimal() else (-1, w.lower()) for w in re.split(r"(\d+)", path.name) if w]

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The asset's own file: a 3D Gaussian Splatting .ply with motion and lifetimes. numpy only, for inside Blender.
+
+It is a binary little-endian PLY with the property names of 3D Gaussian Splatting, so that viewers of those show it
+(every Gaussian at its own time), followed by t, scale_t, vx, vy, vz. Two things are left out: normals, which no splat
+viewer uses, and f_rest_*, because the colour does not depend on the direction. Clip metadata stands in
+`comment timesplat <key> <value>` lines. See `write_ply` for the units.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ...datagen.sequence import InputError
+from .asset import ARRAYS, SH_C0, STATIC_SIGMA_T, Asset, Clip, check
+from .atomic import atomic_write
+
+POSITION, COLOUR, SCALE = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("scale_0", "scale_1", "scale_2")
+ROTATION, VELOCITY = ("rot_0", "rot_1", "rot_2", "rot_3"), ("vx", "vy", "vz")
+PROPERTIES_3DGS = (*POSITION, *COLOUR, "opacity", *SCALE, *ROTATION)
+PROPERTIES_4D = ("t", "scale_t", *VELOCITY)
+
+OPACITY_MARGIN = 1e-6  # opacities are kept this far from 0 and 1, because they are written as logits
+FORMAT_VERSION = 1
+MAX_HEADER_BYTES = 1 << 16
+_NUMPY_TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
+    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+
+
+# ---------------------------------------------------------------- writing
+
+
+def write_ply(path: str | Path, asset: Asset) -> None:
+    """Writes the asset; the file appears whole or not at all. Raises InputError (see `check`).
+
+    Positions and velocities are in normalised units (per unit of model time), f_dc = (rgb - 0.5)/SH_C0,
+    opacity is a logit, scale_* and scale_t are natural logs, rot_* is w x y z. Reading gives the same
+    values back to float32 precision (a relative 1e-6), except that opacities nearer than 1e-6 to 0 or 1
+    are moved to that distance."""
+    check(asset, path)
+    exact = replace(asset, **{name: getattr(asset, name).astype(np.float64) for name in ARRAYS})
+    columns = columns_3dgs(exact) | {"t": exact.t, "scale_t": np.log(exact.sigma_t)}
+    columns |= dict(zip(VELOCITY, exact.velocity.T, strict=True))
+    with atomic_write(path) as tmp:
+        tmp.write_bytes(ply_bytes(columns, [f"timesplat {key} {value}" for key, value in _metadata(asset.clip)]))
+
+
+def columns_3dgs(asset: Asset) -> dict[str, np.ndarray]:
+    """The PROPERTIES_3DGS of the asset's Gaussians, (N,) each, computed in the precision of its arrays."""
+    opacity = np.clip(asset.opacity.astype(np.float64), OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    return {
+        **dict(zip(POSITION, asset.xyz.T, strict=True)),
+        **dict(zip(COLOUR, ((asset.rgb - 0.5) / SH_C0).T, strict=True)),
+        "opacity": np.log(opacity / (1 - opacity)),
+        **dict(zip(SCALE, np.log(asset.scale).T, strict=True)),
+        **dict(zip(ROTATION, asset.rotation.T, strict=True)),
+    }
+
+
+def ply_bytes(columns: dict[str, np.ndarray], comments: list[str]) -> bytes:
+    """A whole binary .ply with a float property for each of the columns (N,), in their order."""
+    count = len(next(iter(columns.values())))
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+    header += [f"element vertex {count}", *(f"property float {name}" for name in columns), "end_header", ""]
+    return "\n".join(header).encode("ascii") + np.stack(list(columns.values()), 1).astype("<f4").tobytes()
+
+
+def _metadata(clip: Clip) -> list[tuple[str, object]]:
+    """What the comments say, by key; `_clip` reads it."""
+    return [
+        ("version", FORMAT_VERSION),
+        ("fps", float(clip.fps)),
+        ("frame_start", clip.frame_start),
+        ("frame_end", clip.frame_end),
+        ("scale", float(clip.scale)),
+        ("translation", " ".join(repr(float(x)) for x in clip.translation)),
+        ("colour_space", "sRGB"),
+        ("pixel", float(clip.pixel)),
+    ]
+
+
+# ---------------------------------------------------------------- reading
+
+
+def read_ply(path: str | Path) -> Asset:
+    """Reads what `write_ply` wrote, or any uncompressed binary 3DGS .ply: without the time columns it is a
+    static asset (v = 0, t = 0, sigma_t = STATIC_SIGMA_T), without comments the clip is Clip(). Unknown
+    properties (normals, f_rest_*) are passed over; quaternions are normalised, zero ones become the
+    identity. Raises InputError: one sentence with the file, what is wrong and what to do."""
+    path = Path(path)
+    rows, meta = _read_rows(path)
+    moves = _is_4d(rows.dtype.names, path)
+    count = len(rows)
+
+    def get(*properties: str) -> np.ndarray:
+        """(N,k), or (N,) of one property."""
+        out = np.stack([rows[p] for p in properties], -1).astype(np.float64)
+        wrong = ~np.isfinite(out)
+        if wrong.any():
+            prop = properties[int(wrong.any(0).argmax())]
+            raise InputError(
+                f"{path}: {prop} holds NaN or infinity in {wrong.any(1).sum()} of {count} Gaussians; "
+                "remove those Gaussians or export the file again."
+            )
+        return out if len(properties) > 1 else out.squeeze(1)
+
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
+        quaternion = get(*ROTATION)
+        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        quaternion = np.where(length > 0, quaternion / np.maximum(length, 1e-300), [1.0, 0, 0, 0])
+        arrays = {
+            "xyz": get(*POSITION),
+            "t": get("t") if moves else np.zeros(count),
+            "velocity": get(*VELOCITY) if moves else np.zeros((count, 3)),
+            "sigma_t": np.exp(get("scale_t")) if moves else np.full(count, STATIC_SIGMA_T),
+            "scale": np.exp(get(*SCALE)),
+            "rotation": quaternion,
+            "rgb": 0.5 + SH_C0 * get(*COLOUR),
+            "opacity": 1 / (1 + np.exp(-get("opacity"))),
+        }
+        asset = Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=_clip(meta, path))
+    check(asset, path)
+    return asset
+
+
+def _read_rows(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+    """-> the vertices as a record array, and the `comment timesplat` values."""
+    try:
+        with open(path, "rb") as f:
+            dtype, count, meta, offset = _header(f.read(MAX_HEADER_BYTES), path)
+            have = os.fstat(f.fileno()).st_size - offset
+            if have < count * dtype.itemsize:
+                raise InputError(
+                    f"{path}: the file is truncated, {count} Gaussians were announced and there is data for "
+                    f"{have // dtype.itemsize}; copy or export it again."
+                )
+            f.seek(offset)
+            return np.fromfile(f, dtype, count), meta
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the name.") from None
+    except OSError as e:
+        raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
+
+
+def _is_4d(names: tuple[str, ...], path: Path) -> bool:
+    """Whether the properties of time are there. Raises InputError if some of them are not, or those of a splat."""
+    if missing := [p for p in PROPERTIES_3DGS if p not in names]:
+        hint = "it is a compressed splat file" if "packed_position" in names else "it is not a Gaussian splat"
+        raise InputError(
+            f"{path}: the property {missing[0]} is missing, {hint}; export it as an uncompressed 3DGS .ply."
+        )
+    found = [p for p in PROPERTIES_4D if p in names]
+    if found and len(found) < len(PROPERTIES_4D):
+        lost = next(p for p in PROPERTIES_4D if p not in names)
+        raise InputError(f"{path}: it has {found[0]} but lacks {lost}; export it again from Timesplat.")
+    return bool(found)
+
+
+def _header(head: bytes, path: Path) -> tuple[np.dtype, int, dict[str, str], int]:
+    """-> row dtype, number of rows, `comment timesplat` values, where the data begins."""
+    if not re.match(rb"ply\r?\n", head):
+        raise InputError(f"{path}: it is not a .ply file; choose a Gaussian splat .ply.")
+    end = re.search(rb"\nend_header\r?\n", head)
+    if end is None:
+        raise InputError(f"{path}: the header has no end, the file is truncated; copy or export it again.")
+    order, count, properties, meta, elements = None, 0, [], {}, []
+    try:
+        for line in head[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
+            word = line.split()
+            if word[:1] == ["format"]:
+                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(word[1])
+                if order is None:
+                    raise InputError(f"{path}: its format is {word[1]}; convert it to a binary .ply.")
+            elif word[:2] == ["comment", "timesplat"]:
+                meta[word[2]] = " ".join(word[3:])
+            elif word[:1] == ["element"]:
+                elements.append(word[1])
+                if word[1] == "vertex":
+                    count = int(word[2])
+            elif word[:1] == ["property"] and elements[-1] == "vertex":
+                if order is None:
+                    raise ValueError("it names no format")
+                properties.append((word[2], order + _NUMPY_TYPES[word[1]]))
+        if elements[:1] != ["vertex"]:
+            first = elements[0] if elements else "nothing"
+            raise InputError(
+                f"{path}: its first element is {first}, not vertex; export it as an uncompressed 3DGS .ply."
+            )
+        if count < 0 or not properties:
+            raise ValueError("no vertices")
+        return np.dtype(properties), count, meta, end.end()
+    except InputError:
+        raise
+    except (ValueError, KeyError, IndexError, TypeError) as e:
+        raise InputError(f"{path}: the header is damaged ({e}); copy or export it again.") from None
+
+
+def _clip(meta: dict[str, str], path: Path) -> Clip:
+    if not meta:
+        return Clip()
+    try:
+        if int(meta["version"]) > FORMAT_VERSION:
+            raise InputError(f"{path}: it was written by a newer Timesplat; update yours.")
+        x, y, z = (float(v) for v in meta["translation"].split())
+        return Clip(
+            fps=float(meta["fps"]),
+            frame_start=int(meta["frame_start"]),
+            frame_end=int(meta["frame_end"]),
+            scale=float(meta["scale"]),
+            translation=(x, y, z),
+            pixel=float(meta.get("pixel", 0)),
+        )
+    except InputError:
+        raise
+    except (KeyError, ValueError) as e:
+        raise InputError(f"{path}: the clip's comments are damaged ({e}); export it again.") from None

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every suffix both ways, and sequences of files."""
+
+import gzip
+import math
+import re
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from timesplat.datagen.sequence import InputError
+from timesplat.model.io import files
+from timesplat.model.io.asset import STATIC_SIGMA_T, VISIBLE, Clip, LoadedAsset
+from timesplat.model.io.files import READABLE, WRITABLE, frame_files, read_asset, read_frames, write_asset
+from timesplat.model.io.ply import write_ply
+from timesplat.model.io.slices import SLICE_FORMATS, write_slice
+from timesplat.model.io.usd_stage import USD_SUFFIXES
+
+from ...assets import assert_same, make_asset
+
+SPZ = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20))  # one Gaussian, Y up
+
+
+def test_each_frame_of_a_sequence_shows_its_own_file(tmp_path):
+    parts = [make_asset(n, seed=n, sigma=(9, 10)) for n in (5, 9, 3, 6)]
+    names = ["f_2.ply", "f_9.ply", "f_10.ply", "f_100.ply"]
+    for part, name in zip(parts, names, strict=True):
+        write_slice(tmp_path / name, part, part.clip.frame_start)
+    stills = [read_asset(tmp_path / n).asset for n in names]
+    assert frame_files(tmp_path) == [tmp_path / n for n in names]
+    loaded = read_frames([tmp_path / n for n in sorted(names)], fps=12, frame_start=7)
+    asset = loaded.asset
+    assert_same(asset, read_asset(tmp_path, fps=12, frame_start=7).asset, 0, 0)
+    assert asset.clip == Clip(12, 7, 10) and loaded.up == "-Y"
+    for frame, one in zip(range(7, 11), stills, strict=True):
+        xyz, opacity = asset.at(asset.frame_to_time(frame))
+        own = asset.t == np.float32(asset.frame_to_time(frame))
+        np.testing.assert_array_equal(xyz[own], one.xyz)
+        np.testing.assert_array_equal(opacity[own], one.opacity)  # whole
+        assert opacity[~own].max() < VISIBLE / 4
+        for name in ("scale", "rotation", "rgb"):
+            np.testing.assert_array_equal(getattr(asset, name)[own], getattr(one, name))
+    half = asset.at(asset.frame_to_time(7.5))[1] / asset.opacity
+    np.testing.assert_allclose(half[:8], math.exp(-9 / 8), rtol=1e-4)
+    single = read_frames([tmp_path / "f_2.ply"]).asset
+    assert (single.sigma_t == STATIC_SIGMA_T).all()
+
+
+def test_what_is_no_sequence_is_refused(tmp_path, monkeypatch):
+    asset = make_asset(9, sigma=(9, 10))
+    for name in ("a.ply", "b.ply"):
+        write_slice(tmp_path / name, asset, 5)
+    write_ply(tmp_path / "four.ply", asset)
+    (tmp_path / "up.spz").write_bytes(SPZ)
+    for other in ("four.ply", "up.spz"):
+        with pytest.raises(InputError, match=f"{other}: it is no frame of a sequence .* import it alone"):
+            read_frames([tmp_path / "a.ply", tmp_path / other])
+    with pytest.raises(InputError, match="USD files hold their frames themselves; import them one by one"):
+        read_frames([tmp_path / "a.ply", tmp_path / "b.usdc"])
+    with pytest.raises(InputError, match="No file"):
+        read_frames([])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"there is no \.ply"):
+        frame_files(tmp_path / "empty")
+    with pytest.raises(InputError, match="cannot be read"):
+        frame_files(tmp_path / "nowhere")
+    monkeypatch.setattr(files, "MAX_GAUSSIANS", 9)
+    with pytest.raises(InputError, match=r"b\.ply: with it the sequence has more than 9"):
+        read_frames([tmp_path / "a.ply", tmp_path / "b.ply"])
+
+
+# ---------------------------------------------------------------- one file
+
+
+@pytest.mark.parametrize("suffix", READABLE)
+def test_no_file_and_a_folder(tmp_path, suffix, monkeypatch):
+    if suffix in USD_SUFFIXES:
+        pytest.importorskip("pxr")
+    with pytest.raises(InputError, match="no such file"):
+        read_asset(tmp_path / f"a{suffix}")
+    (tmp_path / f"b{suffix}").mkdir()
+    with pytest.raises(InputError, match="it is a folder"):
+        read_frames([tmp_path / f"b{suffix}"])
+
+    def full(path):
+        raise MemoryError
+
+    monkeypatch.setitem(files.READERS, suffix, full)
+    with pytest.raises(InputError, match="it takes more memory than there is"):
+        read_asset(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_what_is_written_is_read_back(tmp_path, suffix):
+    if suffix in USD_SUFFIXES:
+        pytest.importorskip("pxr")
+    asset, path = make_asset(), tmp_path / f"a{suffix}"
+    assert write_asset(path, asset) == len(asset) and path.is_file()
+    loaded = read_asset(path)
+    assert (loaded.up, loaded.note, loaded.motion) == ("Z", "", None)
+    assert_same(asset, loaded.asset)
+
+
+@pytest.mark.parametrize("suffix", SLICE_FORMATS)
+def test_a_frame_that_is_written_is_read_back(tmp_path, suffix):
+    asset, path = make_asset(), tmp_path / f"a{suffix.upper()}"
+    count = write_asset(path, asset, frame=12.5)
+    loaded = read_asset(path)
+    assert count == len(loaded.asset) == (asset.at(asset.frame_to_time(12.5))[1] >= VISIBLE).sum()
+    assert loaded.up == "-Y" and (loaded.asset.sigma_t == STATIC_SIGMA_T).all()
+
+
+def test_options_go_to_the_writer(tmp_path):
+    pytest.importorskip("pxr")
+    asset = make_asset()
+    motion = np.tile(np.eye(4), (24, 1, 1))
+    motion[:, 0, 3] = np.arange(24)
+    write_asset(tmp_path / "a.usda", asset, mode="points", motion=motion)
+    np.testing.assert_allclose(read_asset(tmp_path / "a.usda").motion, motion, atol=1e-12)
+    with pytest.raises(TypeError, match="mode"):
+        write_asset(tmp_path / "a.ply", asset, mode="points")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (read_asset, "its name must end in .ply, .splat, .spz, .usd, .usdc, .usda, .usdz; choose one of these."),
+        (lambda path: write_asset(path, make_asset()), "cannot write that; choose .ply, .usd, .usdc, .usda, .usdz."),
+        (lambda path: write_asset(path, make_asset(), frame=3), "the name of a slice must end in .ply or .splat;"),
+    ],
+)
+def test_an_unknown_suffix_is_refused_in_a_sentence(tmp_path, call, words):
+    with pytest.raises(InputError, match=re.escape(f"a.obj: {words}")):
+        call(tmp_path / "a.obj")
+
+
+def test_a_new_format_is_one_entry(tmp_path, monkeypatch):
+    asset = make_asset(3)
+    monkeypatch.setitem(files.READERS, ".new", lambda path: LoadedAsset(asset, "Y", path.read_text()))
+    monkeypatch.setitem(files.WRITERS, ".new", lambda path, asset: path.write_text(f"{len(asset)}"))
+    assert write_asset(tmp_path / "a.new", asset) == 3
+    assert read_asset(tmp_path / "a.new").note == "3"
+
+
+def test_neither_torch_nor_pxr_is_imported_before_it_is_needed():
+    code = "import sys, timesplat.model.io.files\nprint([m for m in ('torch', 'pxr', 'bpy') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"
