@@ -33,7 +33,7 @@ from ..datagen.sequence import InputError, Sequence, read_sequence
 from ..model.fitting.budget import SECONDS
 from ..model.geometry.coverage import SURFACES, coverage
 from ..model.io.asset import write_ply
-from ..model.parallel import clock
+from ..model.parallel import work_clock
 from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, clip_of
 from ..model.views import Views
 from . import protocol
@@ -192,9 +192,9 @@ def measure(name: str, seq: Sequence, point: Point) -> dict:
     way, views, truth = parse(point.label), _views(seq.root, point.setup, point.size), _truth(seq.root, point.size)
     what = views if way.passes else replace(views, depth=None, flow=None)
     row, scene = evaluate_views(what, way.spec, truth, way.checkpoint, None, way.seconds)
-    start = clock()
+    start = work_clock()
     draw(scene, truth.views)
-    row["render_ms"] = 1000 * (clock() - start) / len(truth.picture)
+    row["render_ms"] = 1000 * (work_clock() - start) / len(truth.picture)
     row["ply_mb"], row["usd_mb"] = megabytes(scene, seq)
     row["coverage"] = coverage(scene, what)[0] if way.spec in SURFACES else None
     row |= {"gaussians": row["gaussians_kept"], "object": name, "way": way.label, "setup": point.setup}

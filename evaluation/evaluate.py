@@ -25,8 +25,8 @@ from tqdm import tqdm
 
 from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
 from ..model.fitting.budget import parse as parse_budget
-from ..model.gaussians import Gaussians4D, Moving
-from ..model.parallel import clock
+from ..model.gaussians import DynamicScene, Gaussians4D
+from ..model.parallel import work_clock
 from ..model.rasterize import render
 from ..model.rasterize.timeline import WORTH, Timeline
 from ..model.reconstruct import CHECKPOINTS, METHODS, NEEDS_PASSES, WEIGHTS, reconstruct_views
@@ -127,7 +127,7 @@ def _fraction(seq: Sequence, size: int | None) -> int:
     return by
 
 
-def draw(g: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
+def draw(g: Gaussians4D | DynamicScene, views: Views) -> tuple[Tensor, Tensor]:
     """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
     paper's inference filters."""
     height, width = views.size
@@ -137,7 +137,7 @@ def draw(g: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
         return render(g, views.c2w, views.intrinsics, views.time, width, height, inference=True)
 
 
-def score(scene: Gaussians4D | Moving, truth: Truth, lpips: LPIPS | None = None) -> dict[str, list]:
+def score(scene: Gaussians4D | DynamicScene, truth: Truth, lpips: LPIPS | None = None) -> dict[str, list]:
     """-> per view of truth, in its order: psnr, psnr_fg, ssim, lpips (None without its weights) and, of novel
     views alone, flip (None for the others, as it is dear); and whether the view is novel."""
     rgb, alpha = draw(scene, truth.views)
@@ -164,13 +164,13 @@ def evaluate_views(
     checkpoint: Path | None = None,
     lpips: LPIPS | None = None,
     seconds: float = 10.0,
-) -> tuple[dict, Gaussians4D | Moving]:
+) -> tuple[dict, Gaussians4D | DynamicScene]:
     """Reconstructs from views (with depth and flow where the method needs them) and scores -> `summarise` of the
     scores, which are in `frames`; seconds of the reconstruction and of drawing and scoring a view; how many
     Gaussians there are, and are kept by the filters. And the scene, of those kept. `seconds` is what methods
     that fit a scene may take."""
     wanted = parse_method(method)
-    start = clock()
+    start = work_clock()
     with torch.no_grad():  # methods that optimise turn gradients on again
         refine = wanted.refine or 0.0
         scene = reconstruct_views(
@@ -178,9 +178,9 @@ def evaluate_views(
             dense=wanted.dense,
         )  # fmt: skip
         kept = scene[scene.alive()]
-    taken = clock() - start
+    taken = work_clock() - start
     frames = score(kept, truth, lpips)
-    each = (clock() - start - taken) / len(truth.picture)
+    each = (work_clock() - start - taken) / len(truth.picture)
     row = {"seconds": taken, "seconds_scoring": each, "gaussians": len(scene), "gaussians_kept": len(kept)}
     return summarise(frames) | row | {"frames": frames}, kept
 

@@ -42,7 +42,7 @@ def planes_from_tokens(x: Tensor) -> Tensor:
 
 @dataclass
 class Deformed:
-    """N Gaussians that a HexPlane moves; see `Moving` in gaussians.py."""
+    """N Gaussians that a HexPlane moves; see `DynamicScene` in gaussians.py."""
 
     canonical: Gaussians4D  # (N,) without motion, alive at all times
     planes: Tensor  # (6,C,R,R), rows along a plane's second axis, -1 to 1 from first to last

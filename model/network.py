@@ -25,8 +25,9 @@ from torch.utils.checkpoint import checkpoint
 
 from ..datagen.sequence import InputError
 from . import hexplane
-from .gaussians import Gaussians4D, Moving, isoclinic_rotation, kinematic_from_covariance
+from .gaussians import DynamicScene, Gaussians4D, kinematic_from_covariance
 from .geometry.lift import FEATURES, Geometry
+from .rotations import isoclinic_rotation, quaternion_multiply
 from .views import Views, pluecker, rays
 
 
@@ -137,7 +138,9 @@ class Network(nn.Module):
             nn.init.zeros_(self.decode.weight)  # starts as the Geometry itself
             self.fade_free()
 
-    def forward(self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True) -> Gaussians4D | Moving:
+    def forward(
+        self, views: Views, geometry: Geometry | None = None, drop_empty: bool = True
+    ) -> Gaussians4D | DynamicScene:
         """views: V images, height and width multiples of the patch; geometry: for the sources `sweep` and
         `given`. Pixels in dropped patches, and pixels that own no Gaussian of the
         geometry, yield none."""
@@ -176,7 +179,7 @@ class Network(nn.Module):
     def decode_scene(
         self, views: Views, geometry: Geometry | None, keep: Tensor, pixels: tuple[Tensor, Tensor, Tensor],
         x: Tensor, free: Tensor, planes: Tensor,
-    ) -> Gaussians4D | Moving:  # fmt: skip
+    ) -> Gaussians4D | DynamicScene:  # fmt: skip
         """The Gaussians of the transformer's tokens; pixels: ray origins, directions (T,p²,3) and times (T,p²,1)."""
         c, p = self.config, self.config.patch
         origin, direction, time = pixels
@@ -281,7 +284,7 @@ class Network(nn.Module):
             velocity=base.velocity + 4 * torch.tanh(0.25 * g[..., 15:18]),
             sigma_t=base.sigma_t * torch.exp(1.5 * torch.tanh(g[..., 10])),
             scale=base.scale * torch.exp(1.5 * torch.tanh(g[..., 7:10])),
-            rotation=multiply(base.rotation, F.normalize(turn, dim=-1)),
+            rotation=quaternion_multiply(base.rotation, F.normalize(turn, dim=-1)),
             rgb=base.rgb + 0.5 * torch.tanh(g[..., 4:7]),
             opacity=torch.sigmoid(torch.logit(base.opacity, 1e-4) + 4 * torch.tanh(0.5 * g[..., -1])),
         )
@@ -301,21 +304,6 @@ def load_matching(network: Network, trained: Network) -> None:
 
 
 _IDENTITY = torch.tensor([1.0, 0, 0, 0])
-
-
-def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Product of quaternions (…,4), w x y z: first b, then a."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        -1,
-    )
 
 
 def single_precision(device: torch.device):

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from ..datagen.sequence import InputError, Sequence
-from .gaussians import Gaussians4D, Moving
+from .gaussians import DynamicScene, Gaussians4D
 from .io.asset import Clip, pixel_size
 from .views import Views, load_views, pad_to_multiple
 
@@ -60,7 +60,7 @@ def reconstruct(
     refine: float = 0.0,
     budget: str | None = None,
     max_loss: float = 0.1,
-) -> Gaussians4D | Moving:
+) -> Gaussians4D | DynamicScene:
     """Views `indices` of the Sequence (all of them by default) -> the scene, Gaussians filtered out that the
     paper's inference filters would never draw. `progress(fraction, text)` is called between steps; `seconds`
     is what methods that fit a scene may take, `refine` the seconds for which the result is then fitted to the
@@ -94,7 +94,7 @@ def reconstruct_views(
     budget: str | None = None,
     max_loss: float = 0.1,
     dense: bool = False,
-) -> Gaussians4D | Moving:
+) -> Gaussians4D | DynamicScene:
     """The same from tensors; unfiltered. `seconds` is for methods that fit a scene, `progress` for what takes
     seconds; `dense`: tokens of a network everywhere, and not only where the object is."""
     if refine or budget:

@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..fitting.loop import Parameters, Step, gradients, optimise, own, photographs
-from ..gaussians import Gaussians4D, rotation_matrix
+from ..gaussians import Gaussians4D
+from ..rotations import rotation_matrix
 from ..views import Views
 
 POINTS = 8000  # at the start; most lie outside of the object and fade

@@ -24,8 +24,8 @@ from ..fitting.loop import COARSE, Parameters, Step, gradients, optimise, own, p
 from ..gaussians import Gaussians4D
 from ..geometry.plane_sweep import sweep_geometry
 from ..io.asset import Clip
-from ..network import multiply
-from ..parallel import clock
+from ..parallel import work_clock
+from ..rotations import quaternion_multiply
 from ..views import Views
 from .visual_hull import white
 
@@ -50,7 +50,7 @@ RATES = {
 
 @dataclass
 class Motion:
-    """N canonical Gaussians and K rigid motions given at M moments, linear between. A `Moving` scene."""
+    """N canonical Gaussians and K rigid motions given at M moments, linear between. A `DynamicScene`."""
 
     gaussians: Gaussians4D  # (N,) canonical, without motion of their own
     blend: Tensor  # (N,K) shares of the bases, of sum 1
@@ -69,7 +69,7 @@ class Motion:
         """The scene moved by K bases (K,7)."""
         g = self.gaussians
         xyz, turn = moved(g.xyz, self.blend @ bases)
-        return replace(g, xyz=xyz, rotation=multiply(turn, g.rotation))
+        return replace(g, xyz=xyz, rotation=quaternion_multiply(turn, g.rotation))
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -114,7 +114,7 @@ def som(
 ) -> Motion | Gaussians4D:
     """Views (RGB and alpha alone are used) -> Motion on the CPU, after `seconds`, or `steps` where given; where
     no view shows the object, nothing (`white`). For `progress` see `optimise`."""
-    start = clock()
+    start = work_clock()
     with gradients():
         views = own(views)
         generator = torch.Generator().manual_seed(seed)
@@ -154,7 +154,7 @@ def som(
             )
             return out + RIGID * (at - rest).square().mean()
 
-        left = seconds - (clock() - start)
+        left = seconds - (work_clock() - start)
         optimise(
             p,
             lambda: activate(p.values, moments, smooth),

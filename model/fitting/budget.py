@@ -14,7 +14,7 @@ import re
 import torch
 
 from ...datagen.sequence import InputError
-from ..gaussians import Gaussians4D, Moving
+from ..gaussians import DynamicScene, Gaussians4D
 from ..views import Views
 from .loop import gradients, own
 from .merge import contribution
@@ -41,7 +41,7 @@ def parse(text: str) -> int | float | None:
 
 
 def reduced(
-    start: Gaussians4D | Moving,
+    start: Gaussians4D | DynamicScene,
     views: Views,
     budget: str,
     seconds: float = 0.0,

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fitting a scene to its views by gradient descent, for a number of seconds: the loop that per-scene methods
-share. What the scene is made of, and how, is the caller's; any `Moving` scene or Gaussians4D will do.
+share. What the scene is made of, and how, is the caller's; any `DynamicScene` or Gaussians4D will do.
 
 The parameters are rows of raw tensors with Adam's moments beside, so that Gaussians can be added and taken
 away between steps.
@@ -19,8 +19,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
-from ..gaussians import Gaussians4D, Moving
-from ..parallel import clock
+from ..gaussians import DynamicScene, Gaussians4D
+from ..parallel import work_clock
 from ..rasterize import render
 from ..views import Views, pad_to_multiple
 
@@ -103,7 +103,7 @@ class Step:
     alpha: Tensor  # (B,H,W)
     views: Views  # the B views that were drawn
     background: Tensor  # (3,)
-    scene: Gaussians4D | Moving
+    scene: Gaussians4D | DynamicScene
     fraction: float  # of the budget spent, 0..1
 
 
@@ -166,7 +166,7 @@ def ready(device: str) -> None:
 
 def optimise(
     parameters: Parameters,
-    scene: Callable[[], Gaussians4D | Moving],
+    scene: Callable[[], Gaussians4D | DynamicScene],
     views: Views,
     loss: Callable[[Step], Tensor],
     seconds: float,
@@ -199,10 +199,10 @@ def optimise(
     turns = Turns(0, count, generator), Turns(count, len(views), generator)
     if steps is None:
         ready(views.rgb.device.type)
-    start, told, done = clock(), 0.0, 0
+    start, told, done = work_clock(), 0.0, 0
     bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
     while True:
-        elapsed = clock() - start
+        elapsed = work_clock() - start
         spent, most = (elapsed, seconds) if steps is None else (done, steps)
         fraction = max(spent / most, done / enough if enough else 0.0) if most > 0 else 1.0
         fraction = min(fraction, 1.0)

@@ -24,8 +24,8 @@ from torch import Tensor
 from ...datagen.rigs import spherical
 from ...datagen.sequence import InputError, opengl_to_opencv
 from ..baselines.four_dgs import EVERY, RATES, UNTIL, activate, densify
-from ..gaussians import Gaussians4D, Moving
-from ..parallel import clock
+from ..gaussians import DynamicScene, Gaussians4D
+from ..parallel import work_clock
 from ..rasterize import render
 from ..views import Views
 from .loop import Parameters, Step, gradients, optimise, own, photographs, ready, shrunk
@@ -73,7 +73,7 @@ def check_seconds(seconds: float) -> None:
 
 
 def refine(
-    start: Gaussians4D | Moving,
+    start: Gaussians4D | DynamicScene,
     views: Views,
     seconds: float,
     device: str = "cpu",
@@ -96,7 +96,7 @@ def refine(
     if (seconds == 0 and not steps) or not len(start) or (len(views) < FEWEST and not near and count is None):
         return start
     ready(device)
-    began = clock()
+    began = work_clock()
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g = g[g.alive()].with_axes()
@@ -123,7 +123,7 @@ def refine(
                 values,
                 RATES,
                 views,
-                max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
+                max(seconds - (work_clock() - began), 0.5 * (1 - first) * seconds),
                 beside=beside,
                 most=most,
                 price=price,

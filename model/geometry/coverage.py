@@ -17,8 +17,9 @@ from torch.nn.functional import max_pool2d
 
 from ...datagen.rigs import DISTANCE, spherical
 from ...datagen.sequence import focal_from_fov, opengl_to_opencv
-from ..gaussians import Gaussians4D, rotation_matrix
+from ..gaussians import Gaussians4D
 from ..rasterize import render
+from ..rotations import rotation_matrix
 from ..views import Views
 
 SURFACES = {"lift", "guided", "rgb", "sweep"}  # methods whose Gaussians know which way their surface faces

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D, quaternion
+from ..gaussians import Gaussians4D
+from ..rotations import quaternion_from_matrix
 from ..views import Views, camera_rays
 from .tracking import Points, follow
 
@@ -78,7 +79,7 @@ def lift_geometry(views: Views, shortest: float = SHORTEST) -> Geometry:
         velocity=velocity / step,
         sigma_t=(LIFE * half).clamp_min(shortest) * step,
         scale=scale[owner],
-        rotation=quaternion(axes)[owner],
+        rotation=quaternion_from_matrix(axes)[owner],
         rgb=views.rgb[valid][owner],
         opacity=(OPACITY * alpha).clamp(1e-3, 0.99)[owner],
     )

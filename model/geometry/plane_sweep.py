@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..parallel import each, parts
+from ..parallel import chunks, parallel_for
 from ..views import Views, camera_rays
 from .lift import FEATURES, Geometry, lift_geometry
 
@@ -128,17 +128,17 @@ def _swept(views: Views) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     mask = alpha > 0.35
     V, H, W = mask.shape
     rim = np.ones(mask.shape, np.float32)
-    each([(i,) for i in range(V)], lambda i: _rims(mask[i], rim[i]))
+    parallel_for([(i,) for i in range(V)], lambda i: _rims(mask[i], rim[i]))
     silhouette = np.log(np.maximum(alpha, np.float32(0.02)))
     pictures = np.concatenate([views.rgb.numpy(), silhouette[..., None], rim[..., None]], -1).astype(np.float32)
     arrays = [np.ascontiguousarray(x.numpy()) for x in (*_voters(views), views.c2w, views.intrinsics)]
     out = [np.zeros(mask.shape, np.float32) for _ in range(3)]
-    each(parts(V * H, 64), lambda a, b: _sweep(a, b, pictures, mask, *arrays, *out))
+    parallel_for(chunks(V * H, 64), lambda a, b: _sweep(a, b, pictures, mask, *arrays, *out))
     depth, spread, certainty = out
     for n in range(BLUR):
         stride, old = max(round((n + 1) * W / 128), 1), (depth, spread)
         depth, spread = depth.copy(), spread.copy()
-        each(parts(V * H, 256), lambda a, b: _smooth(a, b, stride, pictures, *old, depth, spread))  # noqa: B023
+        parallel_for(chunks(V * H, 256), lambda a, b: _smooth(a, b, stride, pictures, *old, depth, spread))  # noqa: B023
     return tuple(map(torch.from_numpy, (depth, spread, certainty, rim)))
 
 

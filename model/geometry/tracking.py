@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..parallel import each, parts
+from ..parallel import chunks, parallel_for
 from ..views import Views
 
 GRID = 24  # voxels along [-EXTENT, EXTENT]
@@ -70,7 +70,7 @@ def follow(views: Views, points: Points, seen: Tensor) -> tuple[Tensor, Tensor, 
     pieces = np.zeros((n, PIECES, 8), np.float32)
     count, summary = np.zeros(n, np.int64), np.zeros((n, 4), np.float32)
     known = (points.view.numpy(), *arrays, field.numpy(), order, np.float32(-last), np.float32(last), settings)
-    each(parts(n, 4096), lambda first, end: _tracks(first, end, *known, pieces, count, summary))
+    parallel_for(chunks(n, 4096), lambda first, end: _tracks(first, end, *known, pieces, count, summary))
     taken = np.arange(PIECES)[None] < count[:, None]
     owner = np.repeat(np.arange(len(count)), count)
     return torch.from_numpy(pieces[taken]), torch.from_numpy(owner), torch.from_numpy(summary)
@@ -98,7 +98,7 @@ def scene_flow(views: Views, points: Points, A: Tensor, next_b: Tensor, previous
     known = [x.contiguous().numpy() for x in (cell, B, next_b, previous_b)]
     weights = np.array([COARSE, COARSEST, SLIDE, SPIN], np.float32)
     beyond = np.array([1, *BEYOND], np.float32)
-    each([(t,) for t in range(intervals)], lambda t: _field(t, frame, *known, beyond, weights, field))
+    parallel_for([(t,) for t in range(intervals)], lambda t: _field(t, frame, *known, beyond, weights, field))
     return torch.from_numpy(field)
 
 

@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D, Moving
+from ..gaussians import DynamicScene, Gaussians4D
 
 BACKENDS = ("cpu", "cuda", "triton", "reference")
 NEAR = 0.01  # nearest depth of a centre
@@ -131,7 +131,7 @@ def _check_finite(tensors: dict[str, Tensor], dtype=None) -> None:
 
 
 def render(
-    scene: Gaussians4D | Moving, c2w: Tensor, intrinsics: Tensor, time: Tensor, width: int, height: int, **kw
+    scene: Gaussians4D | DynamicScene, c2w: Tensor, intrinsics: Tensor, time: Tensor, width: int, height: int, **kw
 ) -> tuple[Tensor, Tensor]:
     """`rasterize` of a cloud without batch dimensions, or of another moving scene, which is asked for its
     state once for every distinct time; same cameras, keywords, results and errors."""

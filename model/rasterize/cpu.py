@@ -18,7 +18,7 @@ import math
 import numpy as np
 import torch
 
-from ..parallel import each
+from ..parallel import parallel_for
 from . import ALPHA_MAX, T_STOP, project
 from .chain import chain
 from .project import (
@@ -281,7 +281,7 @@ class _Rasterize(torch.autograd.Function):
         tiles = -(-width // TILE) * -(-height // TILE)
         image, alpha = np.empty((views, height, width, 3), np.float32), np.empty((views, height, width), np.float32)
         kept = np.empty((views, tiles, TILE // ROWS, 2, PLANE), np.float32)
-        drawn = each(
+        drawn = parallel_for(
             [(c,) for c in range(views)],
             lambda c: project.project_view(c, inputs, cameras, width, height, inference),
         )  # per view: ids, P, starts, pairs, slots, first
@@ -290,7 +290,7 @@ class _Rasterize(torch.autograd.Function):
             _, P, starts, pairs, _, _ = drawn[c]
             _blend_tiles(band, P, starts, pairs, background, image[c], alpha[c], kept[c])
 
-        each(itertools.product(range(views), _bands(width, height)), blend)
+        parallel_for(itertools.product(range(views), _bands(width, height)), blend)
         ctx.saved = inputs, cameras, size, background, drawn, kept
         dtype = tensors[0].dtype
         return torch.from_numpy(image).to(dtype), torch.from_numpy(alpha).to(dtype)
@@ -306,7 +306,7 @@ class _Rasterize(torch.autograd.Function):
             _, P, starts, pairs, slots, _ = drawn[c]
             _unblend_tiles(band, P, starts, pairs, slots, background, g_image[c], g_alpha[c], kept[c], sums[c])
 
-        each(itertools.product(range(views), _bands(width, height)), unblend)
+        parallel_for(itertools.product(range(views), _bands(width, height)), unblend)
         out = tuple(None if x is None else np.zeros(x.shape, np.float32) for x in inputs)
         count, parts = len(inputs[1]), torch.get_num_threads()
 
@@ -315,7 +315,7 @@ class _Rasterize(torch.autograd.Function):
             for c, (ids, _, _, _, _, first) in enumerate(drawn):
                 chain(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
 
-        each([(k,) for k in range(parts)], chain_part)
+        parallel_for([(k,) for k in range(parts)], chain_part)
         out = (x for x in out if x is not None)
         grads = [torch.from_numpy(x.reshape(y.shape)) for x, y in zip(out, tensors, strict=True)]
         return *[None] * 5, *(g if g.dtype == x.dtype else g.to(x.dtype) for g, x in zip(grads, tensors, strict=True))

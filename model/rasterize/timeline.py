@@ -20,7 +20,7 @@ WORTH = 400_000  # Gaussians from which on it is quicker
 
 
 class Timeline:
-    """A moving scene (`Moving`) of 4D Gaussians (N,) that draws as they do with the inference filters on."""
+    """A moving scene (`DynamicScene`) of 4D Gaussians (N,) that draws as they do with the inference filters on."""
 
     def __init__(self, g: Gaussians4D, bins: int = BINS):
         self.gaussians = g
@@ -44,5 +44,5 @@ class Timeline:
         return self.bins[min(k, len(self.bins) - 1)]
 
     def at(self, t: float) -> Gaussians4D:
-        """Those that live about time t, as they are then, for ever (`Moving`)."""
+        """Those that live about time t, as they are then, for ever (`DynamicScene`)."""
         return self.gaussians[self.alive(t)].frozen(t)

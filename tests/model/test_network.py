@@ -11,7 +11,7 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model.gaussians import FIELDS
 from timesplat.model.geometry.lift import lift_geometry
 from timesplat.model.geometry.plane_sweep import sweep_geometry
-from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patch_rays
+from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, patch_rays
 from timesplat.model.reconstruct import geometry_for
 from timesplat.model.views import rays
 
@@ -228,13 +228,6 @@ def test_rays_of_patches_are_those_of_the_pictures(views):
 def test_odd_image_size_is_refused(spheres):
     with pytest.raises(ValueError, match="multiples of 8"):
         Network(Config(**TINY))(spheres([0], size=30))
-
-
-def test_quaternion_product_turns_first_by_the_second():
-    from timesplat.model.gaussians import rotation_matrix
-
-    a, b = torch.nn.functional.normalize(torch.randn(2, 7, 4, dtype=torch.float64), dim=-1)
-    torch.testing.assert_close(rotation_matrix(multiply(a, b)), rotation_matrix(a) @ rotation_matrix(b))
 
 
 def test_rows_lead_from_pixels_to_outputs(views):

@@ -8,11 +8,11 @@ from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import opengl_to_opencv
 from timesplat.evaluation.evaluate import draw
 from timesplat.evaluation.metrics import psnr
-from timesplat.model.gaussians import rotation_matrix
 from timesplat.model.geometry import lift as lift_module
 from timesplat.model.geometry import tracking as follow_module
 from timesplat.model.geometry.lift import lift, lift_geometry, tangent_frame
 from timesplat.model.geometry.tracking import EXTENT, GRID, Points, constraints, scene_flow
+from timesplat.model.rotations import rotation_matrix
 from timesplat.model.views import Views, load_views, rays
 
 FRAMES = list(range(24))

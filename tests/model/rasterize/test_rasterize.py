@@ -18,8 +18,9 @@ import pytest
 import torch
 
 from timesplat.model import rasterize as package
-from timesplat.model.gaussians import Gaussians4D, rotation_matrix
+from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.rasterize import rasterize, render
+from timesplat.model.rotations import rotation_matrix
 
 
 @pytest.fixture(autouse=True)
@@ -341,7 +342,7 @@ def test_kernels_are_compiled_again_when_a_file_they_share_changes(tmp_path):
     """By itself numba's cache looks only at the file that a function is in."""
     folder = tmp_path / "model" / "rasterize"
     shutil.copytree(Path(package.__file__).parent, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "model" / "gaussians.py").write_text("Gaussians4D = Moving = None")
+    (tmp_path / "model" / "gaussians.py").write_text("DynamicScene = Gaussians4D = None")
     code = """
 import importlib, numpy
 from model.rasterize import project
