@@ -26,7 +26,7 @@ from torch.utils.checkpoint import checkpoint
 from ..datagen.sequence import InputError
 from . import hexplane
 from .gaussians import DynamicScene, Gaussians4D, kinematic_from_covariance
-from .geometry.lift import FEATURES, Geometry
+from .geometry.features import LAYOUTS, Geometry
 from .rotations import isoclinic_rotation, quaternion_multiply
 from .views import Views, pluecker, rays
 
@@ -55,7 +55,7 @@ class Config:
 
     @property
     def channels(self) -> int:
-        return 10 + (FEATURES if self.source != "predicted" else 0)
+        return 10 + (LAYOUTS[self.source].width if self.source != "predicted" else 0)
 
     @property
     def outputs(self) -> int:
@@ -156,7 +156,7 @@ class Network(nn.Module):
         time = gather_pixels(views.time[:, None, None, None].expand(*views.alpha.shape, 1), keep, p)
         maps = [2 * colour - 1, time, pluecker(origin, direction)]
         if geometry is not None:
-            maps.append(gather_pixels(geometry.features, keep, p))
+            maps.append(gather_pixels(geometry.features.values, keep, p))
         pixels, free, planes = self.transform(torch.cat(maps, -1).flatten(1))  # (T, p²·channels) -> (T, D) …
         with single_precision(views.rgb.device):  # heads and conversion: a covariance would not stay positive
             return self.decode_scene(views, geometry, keep, (origin, direction, time), pixels, free, planes)
@@ -189,8 +189,8 @@ class Network(nn.Module):
             g = torch.cat([g[..., :3], at, g[..., 3:]], -1)
 
         if geometry is not None:
-            row = self.rows(views, keep)[geometry.owner]  # (M,) which of the outputs is about which Gaussian
-            slack = geometry.slack.flatten()[geometry.owner]
+            row = self.rows(views, keep)[geometry.pixel_index]  # (M,) which of the outputs is about which Gaussian
+            slack = geometry.max_shift.flatten()[geometry.pixel_index]
             out = self.residual(g.flatten(0, 1)[row], geometry.gaussians, direction.flatten(0, 1)[row], slack)
         else:
             out = self.pixel_aligned(g, origin, direction).map(lambda m: m.flatten(0, 1))

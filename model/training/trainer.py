@@ -267,16 +267,16 @@ class Trainer:
         of its pixel, and whether that is known."""
         truth = lift_geometry(inputs)
         if geometry is not None:
-            owner = geometry.owner
+            owner = geometry.pixel_index
         else:
             row = self.network.rows(inputs, self.network.kept_patches(inputs))
             kept = (row >= 0).nonzero()[:, 0]
             owner = kept[torch.argsort(row[kept])]
         view_time = inputs.time[:, None, None].expand_as(inputs.alpha).flatten()
-        away = (truth.gaussians.t - view_time[truth.owner]).abs()
+        away = (truth.gaussians.t - view_time[truth.pixel_index]).abs()
         order = torch.argsort(away, descending=True, stable=True)
         piece = torch.full((len(view_time),), -1)
-        piece.numpy()[truth.owner[order].numpy()] = order.numpy()  # of a pixel's pieces the one of its own time
+        piece.numpy()[truth.pixel_index[order].numpy()] = order.numpy()  # of a pixel's pieces the one of its own time
         return view_time[owner], truth.gaussians[piece[owner]], piece[owner] >= 0
 
     def save(self) -> None:
