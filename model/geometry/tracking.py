@@ -71,8 +71,7 @@ class _PointArrays(NamedTuple):
     place: np.ndarray  # (n,3)
     normal: np.ndarray  # (n,3)
     pixel: np.ndarray  # (n,)
-    A: np.ndarray  # (n,2,3) see `constraints`
-    b: np.ndarray  # (n,2,2) the same: of the motion to the previous frame, and to the next
+    constraint: np.ndarray  # (n,2,8) see `_satisfy`: of the motion to the previous frame, and to the next
 
 
 class _ViewArrays(NamedTuple):
@@ -95,8 +94,8 @@ def track_points(
     intervals = max(round(2 * last), 1)
     A, next_b, previous_b = constraints(views, points)
     field = scene_flow(views, points, A, next_b, previous_b, intervals)
-    b = torch.stack([previous_b, next_b], 1)
-    own = _PointArrays(points.view.numpy(), *map(_float32, (points.place, points.normal, points.pixel, A, b)))
+    constraint = torch.stack([torch.cat([A.flatten(1), b], -1) for b in (previous_b, next_b)], 1)
+    own = _PointArrays(points.view.numpy(), *map(_float32, (points.place, points.normal, points.pixel, constraint)))
     cameras = (frame, views.c2w[:, :3, 3], torch.linalg.inv(views.c2w), views.intrinsics, observed)
     known = (own, _ViewArrays(*map(_float32, cameras)), field.numpy(), np.float32(-last), np.float32(last))
     n = len(points.view)
@@ -183,7 +182,7 @@ def _tracks(begin, end, points, views, field, start, last, settings, pieces, cou
                 for k in range(3):
                     flow[k] *= direction
                 if s == 1:  # the pixel's own motion vector is exact: two of three components are known
-                    _satisfy(points.A[i], points.b[i, side], flow)
+                    _satisfy(points.constraint[i, side], flow)
                 for k in range(3):
                     p[k] += flow[k]
                 taken = gone = False
@@ -223,21 +222,23 @@ def _tracks(begin, end, points, views, field, start, last, settings, pieces, cou
                 summary.frames_before[i] = needed
             else:
                 summary.frames_after[i] = needed
-        count[i] = _cut(path, steps, here, -reach[0], reach[1], settings.straightness * pixel[i], i, pieces)
+        out = pieces.time[i], pieces.half_length[i], pieces.place[i], pieces.velocity[i]
+        count[i] = _cut(path, steps, here, -reach[0], reach[1], settings.straightness * pixel[i], *out)
 
 
 @numba.njit(cache=True, fastmath=True)
-def _satisfy(A, b, motion):
-    """Moves motion (3) by the least amount such that A·motion = b holds; A (2,3), b (2)."""
-    ff = A[0, 0] ** 2 + A[0, 1] ** 2 + A[0, 2] ** 2
-    fg = A[0, 0] * A[1, 0] + A[0, 1] * A[1, 1] + A[0, 2] * A[1, 2]
-    gg = A[1, 0] ** 2 + A[1, 1] ** 2 + A[1, 2] ** 2
-    r = b[0] - (A[0, 0] * motion[0] + A[0, 1] * motion[1] + A[0, 2] * motion[2])
-    s = b[1] - (A[1, 0] * motion[0] + A[1, 1] * motion[1] + A[1, 2] * motion[2])
-    d = 1 / (ff * gg - fg * fg)
-    x, y = (gg * r - fg * s) * d, (ff * s - fg * r) * d
+def _satisfy(row, flow):
+    """Moves flow (3) by the least amount such that A·flow = b holds; row (8): A (2,3) row by row, then b (2). (Written
+    so that its bits do not depend on whether it was compiled now or comes from numba's cache.)"""
+    aa = row[0] ** 2 + row[1] ** 2 + row[2] ** 2
+    ab = row[0] * row[3] + row[1] * row[4] + row[2] * row[5]
+    bb = row[3] ** 2 + row[4] ** 2 + row[5] ** 2
+    r = row[6] - (row[0] * flow[0] + row[1] * flow[1] + row[2] * flow[2])
+    s = row[7] - (row[3] * flow[0] + row[4] * flow[1] + row[5] * flow[2])
+    d = 1 / (aa * bb - ab * ab)
+    x, y = (bb * r - ab * s) * d, (aa * s - ab * r) * d
     for k in range(3):
-        motion[k] += x * A[0, k] + y * A[1, k]
+        flow[k] += x * row[k] + y * row[3 + k]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -250,11 +251,10 @@ def _place_at(path, steps, s, out):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _cut(path, steps, here, first, end, straightness, i, pieces):
+def _cut(path, steps, here, first, end, straightness, time, half_length, place, velocity):
     """Cuts first…end (frames from the path's middle) into pieces that stay within `straightness` of their chords,
-    each as long as it can be; writes them as those of point i and returns how many."""
-    time, half_length, place, velocity = pieces.time, pieces.half_length, pieces.place, pieces.velocity
-    most = time.shape[1]
+    each as long as it can be; writes those of one point, as in `Pieces`, and returns how many."""
+    most = len(time)
     a, b, m = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     n = 0
     begin = first
@@ -277,11 +277,11 @@ def _cut(path, steps, here, first, end, straightness, i, pieces):
         _place_at(path, steps, begin, a)
         _place_at(path, steps, stop, b)
         _place_at(path, steps, 0.5 * (begin + stop), m)
-        time[i, n] = here + 0.5 * (begin + stop)
-        half_length[i, n] = 0.5 * (stop - begin)
+        time[n] = here + 0.5 * (begin + stop)
+        half_length[n] = 0.5 * (stop - begin)
         for k in range(3):
-            place[i, n, k] = 0.25 * (a[k] + b[k]) + 0.5 * m[k]
-            velocity[i, n, k] = (b[k] - a[k]) / (stop - begin)
+            place[n, k] = 0.25 * (a[k] + b[k]) + 0.5 * m[k]
+            velocity[n, k] = (b[k] - a[k]) / (stop - begin)
         n += 1
         begin = stop
     return n
