@@ -269,9 +269,9 @@ class Trainer:
         if geometry is not None:
             owner = geometry.pixel_index
         else:
-            row = self.network.rows(inputs, self.network.kept_patches(inputs))
-            kept = (row >= 0).nonzero()[:, 0]
-            owner = kept[torch.argsort(row[kept])]
+            place = self.network.pixel_places(inputs, self.network.kept_patches(inputs))
+            kept = (place >= 0).nonzero()[:, 0]
+            owner = kept[torch.argsort(place[kept])]
         view_time = inputs.time[:, None, None].expand_as(inputs.alpha).flatten()
         away = (truth.gaussians.t - view_time[truth.pixel_index]).abs()
         order = torch.argsort(away, descending=True, stable=True)

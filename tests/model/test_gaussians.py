@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The two forms of a 4D Gaussian are one: closed forms against float64 linear algebra."""
 
 import torch

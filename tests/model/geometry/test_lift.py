@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The lift on a scene known by hand: places, velocities, footprints, and pictures."""
 
 import numpy as np

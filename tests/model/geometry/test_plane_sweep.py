@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The sweep against exact depth and motion, and its independence of what only a renderer knows."""
 
 import pytest
