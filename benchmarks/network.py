@@ -64,7 +64,7 @@ def flops(network: Network, tokens: int) -> int:
     block = 12 * c.width**2  # qkv, projection, MLP
     every = tokens + c.free
     linear = tokens * (network.embed.weight.numel() + network.decode.weight.numel()) + every * c.depth * block
-    linear += c.free * c.width * c.outputs
+    linear += c.free * c.width * c.free_layout.width
     return 2 * linear + 4 * c.depth * every**2 * c.width
 
 

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ..datagen.sequence import InputError, Sequence
 from ..model.clip import clip_of
-from ..model.gaussians import Gaussians4D, Moving
+from ..model.gaussians import DynamicScene, Gaussians4D
 from ..model.geometry.coverage import coverage
 from ..model.io.ply import write_ply
 from ..model.methods import METHODS, ReconstructOptions
-from ..model.parallel import clock
+from ..model.parallel import work_clock
 from ..model.rasterize import render
 from ..model.rasterize.lifetime_index import QUICKER_FROM, LifetimeIndex
 from ..model.reconstruct import reconstruct_views
@@ -26,7 +26,9 @@ from .method_spec import MethodSpec
 from .metrics import Pictures, measure, summarise
 
 
-def reconstruct(views: Views, method: MethodSpec, device: str = "cpu", seconds: float = 10.0) -> Gaussians4D | Moving:
+def reconstruct(
+    views: Views, method: MethodSpec, device: str = "cpu", seconds: float = 10.0
+) -> Gaussians4D | DynamicScene:
     """The scene that a method makes of views (with depth and flow where it sees them), unfiltered; `seconds` for a
     method that fits the scene and names none."""
     with torch.no_grad():  # methods that fit a scene turn gradients on again
@@ -44,7 +46,7 @@ def reconstruct(views: Views, method: MethodSpec, device: str = "cpu", seconds: 
         )
 
 
-def draw(scene: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
+def draw(scene: Gaussians4D | DynamicScene, views: Views) -> tuple[Tensor, Tensor]:
     """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
     paper's inference filters."""
     height, width = views.size
@@ -54,23 +56,23 @@ def draw(scene: Gaussians4D | Moving, views: Views) -> tuple[Tensor, Tensor]:
         return render(scene, views.c2w, views.intrinsics, views.time, width, height, inference=True)
 
 
-def score(scene: Gaussians4D | Moving, truth: Truth, left_out: tuple[str, ...] = ()) -> dict[str, list]:
+def score(scene: Gaussians4D | DynamicScene, truth: Truth, left_out: tuple[str, ...] = ()) -> dict[str, list]:
     """`metrics.measure` of the scene's pictures of the views of truth."""
     return measure(Pictures(*draw(scene, truth.views), truth), left_out)
 
 
 def evaluate_views(
     views: Views, method: MethodSpec, truth: Truth, device: str = "cpu", left_out: tuple[str, ...] = ()
-) -> tuple[dict, Gaussians4D | Moving]:
+) -> tuple[dict, Gaussians4D | DynamicScene]:
     """Reconstructs from views and scores -> a row: `metrics.summarise` of the scores, which are in `frames`; seconds
     of the reconstruction and of drawing and scoring a view; how many Gaussians there are, and are kept by the
     filters. And the scene, of those kept, on the processor."""
-    start = clock()
+    start = work_clock()
     scene = reconstruct(views, method, device)
     kept = scene[scene.alive()]
-    taken = clock() - start
+    taken = work_clock() - start
     frames = score(kept, truth, left_out)
-    each = (clock() - start - taken) / len(truth.picture)
+    each = (work_clock() - start - taken) / len(truth.picture)
     row = {"seconds": taken, "seconds_scoring": each, "gaussians": len(scene), "gaussians_kept": len(kept)}
     return summarise(frames) | row | {"frames": frames}, kept
 
@@ -78,18 +80,18 @@ def evaluate_views(
 COSTS = ("ply_mb", "usd_mb", "render_ms", "coverage")
 
 
-def costs(scene: Gaussians4D | Moving, views: Views, truth: Truth, method: MethodSpec, seq: Sequence) -> dict:
+def costs(scene: Gaussians4D | DynamicScene, views: Views, truth: Truth, method: MethodSpec, seq: Sequence) -> dict:
     """COSTS: megabytes of the scene as .ply and, where pxr is installed, as .usdc (None of a scene that no asset can
     hold); milliseconds to draw a view; the share of the object that the input views show, where it can be told."""
-    start = clock()
+    start = work_clock()
     draw(scene, truth.views)
-    drawing = 1000 * (clock() - start) / len(truth.picture)
+    drawing = 1000 * (work_clock() - start) / len(truth.picture)
     known = METHODS[method.method].knows_surface and not (method.refine or method.budget or method.dense)
     sizes = megabytes(scene, seq)
     return dict(zip(COSTS, (*sizes, drawing, coverage(scene, views)[0] if known else None), strict=True))
 
 
-def megabytes(scene: Gaussians4D | Moving, seq: Sequence) -> tuple[float | None, float | None]:
+def megabytes(scene: Gaussians4D | DynamicScene, seq: Sequence) -> tuple[float | None, float | None]:
     """Of the scene as .ply and, where pxr is installed, as .usdc."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         ply, usd = Path(folder) / "a.ply", Path(folder) / "a.usdc"

@@ -17,18 +17,30 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .gaussians import Gaussians4D
+from .heads import ACTIVATIONS
+from .layout import Layout
 
 AXES = torch.tensor([[0, 1], [0, 2], [1, 2], [0, 3], [1, 3], [2, 3]])  # of each plane, 3 being time
 SIDE = 4  # tokens along a plane's side
 CELLS = 8  # cells along a token's
 CHANNELS = 16
 TOKENS = len(AXES) * SIDE**2
-LARGEST = 0.3  # σ, as for all of the network's Gaussians
+CHANGES = Layout({"xyz": 3, "rotation": 4, "log_scale": 3})  # what the MLP says of a Gaussian at a time
+
+
+def make_tokens(width: int) -> nn.Parameter:
+    """(TOKENS, width) the learned tokens of the planes."""
+    return nn.Parameter(torch.randn(TOKENS, width) * 0.02)
+
+
+def make_decoder(width: int) -> nn.Linear:
+    """From tokens of that width to the features of their cells."""
+    return nn.Linear(width, CELLS**2 * CHANNELS, bias=False)
 
 
 def make_mlp() -> nn.Sequential:
-    """CHANNELS features -> 10 changes: position 3, quaternion 4, log scale 3. Starts as no change."""
-    layers = [nn.Linear(a, b, bias=False) for a, b in ((CHANNELS, 64), (64, 64), (64, 10))]
+    """CHANNELS features -> CHANGES. Starts as no change."""
+    layers = [nn.Linear(a, b, bias=False) for a, b in ((CHANNELS, 64), (64, 64), (64, CHANGES.width))]
     nn.init.zeros_(layers[-1].weight)
     return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
 
@@ -40,9 +52,15 @@ def planes_from_tokens(x: Tensor) -> Tensor:
     return 1 + x.permute(0, 5, 1, 3, 2, 4).reshape(len(AXES), CHANNELS, SIDE * CELLS, SIDE * CELLS)
 
 
+def deformed(canonical: Gaussians4D, decoded: Tensor, mlp: nn.Sequential) -> Deformed:
+    """N canonical Gaussians, decoded (TOKENS, CELLS²·CHANNELS) the planes' tokens, and the MLP of `make_mlp` -> the
+    scene."""
+    return Deformed(canonical, planes_from_tokens(decoded), [m.weight for m in mlp if isinstance(m, nn.Linear)])
+
+
 @dataclass
 class Deformed:
-    """N Gaussians that a HexPlane moves; see `Moving` in gaussians.py."""
+    """N Gaussians that a HexPlane moves; see `DynamicScene` in gaussians.py."""
 
     canonical: Gaussians4D  # (N,) without motion, alive at all times
     planes: Tensor  # (6,C,R,R), rows along a plane's second axis, -1 to 1 from first to last
@@ -76,12 +94,12 @@ class Deformed:
         x = self.features(t)
         for w in self.weights[:-1]:
             x = F.relu(F.linear(x, w))
-        move, turn, grow = F.linear(x, self.weights[-1]).split([3, 4, 3], -1)
+        change = CHANGES.split(F.linear(x, self.weights[-1]))
         return replace(
             self.canonical,
-            xyz=self.canonical.xyz + move,
-            rotation=F.normalize(self.canonical.rotation + turn, dim=-1),
-            scale=(self.canonical.scale * grow.exp()).clamp_max(LARGEST),
+            xyz=self.canonical.xyz + change["xyz"],
+            rotation=F.normalize(self.canonical.rotation + change["rotation"], dim=-1),
+            scale=(self.canonical.scale * change["log_scale"].exp()).clamp_max(ACTIVATIONS.max_scale),
         )
 
     def features(self, t: float) -> Tensor:

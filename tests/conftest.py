@@ -39,7 +39,7 @@ def steady_clock(monkeypatch):
     """A fit of so many seconds takes as many steps on every machine: each look at its clock is 10 ms later."""
     ticks = itertools.count()
     for module in ("loop", "refine"):
-        monkeypatch.setattr(f"timesplat.model.fitting.{module}.clock", lambda: 0.01 * next(ticks))
+        monkeypatch.setattr(f"timesplat.model.fitting.{module}.work_clock", lambda: 0.01 * next(ticks))
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from ..views import Views
 @dataclass
 class Slices:
     """One unmoving cloud per moment; at any time the cloud of the nearest moment is shown (of two equally near
-    the earlier one). A `Moving` scene: render it with `rasterize.render`."""
+    the earlier one). A `DynamicScene`: render it with `rasterize.render`."""
 
     gaussians: Gaussians4D  # (N,) all moments' clouds, frozen
     owner: Tensor  # (N,) index into `moments`

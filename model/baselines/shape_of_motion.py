@@ -26,8 +26,8 @@ from ..fitting.parameters import Parameters
 from ..gaussians import Gaussians4D
 from ..geometry.plane_sweep import sweep_geometry
 from ..io.asset import Clip
-from ..network import multiply
-from ..parallel import clock
+from ..parallel import work_clock
+from ..rotations import quaternion_multiply
 from ..views import Views
 from .visual_hull import white
 
@@ -52,7 +52,7 @@ RATES = {
 
 @dataclass
 class Motion:
-    """N canonical Gaussians and K rigid motions given at M moments, linear between. A `Moving` scene."""
+    """N canonical Gaussians and K rigid motions given at M moments, linear between. A `DynamicScene`."""
 
     gaussians: Gaussians4D  # (N,) canonical, without motion of their own
     blend: Tensor  # (N,K) shares of the bases, of sum 1
@@ -71,7 +71,7 @@ class Motion:
         """The scene moved by K bases (K,7)."""
         g = self.gaussians
         xyz, turn = moved(g.xyz, self.blend @ bases)
-        return replace(g, xyz=xyz, rotation=multiply(turn, g.rotation))
+        return replace(g, xyz=xyz, rotation=quaternion_multiply(turn, g.rotation))
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -116,7 +116,7 @@ def shape_of_motion(
 ) -> Motion | Gaussians4D:
     """Views (RGB and alpha alone are used) -> Motion on the CPU, after `seconds`, or `steps` where given; where
     no view shows the object, nothing (`white`). For `progress` see `optimise`."""
-    start = clock()
+    start = work_clock()
     with gradients():
         views = detached(views)
         generator = torch.Generator().manual_seed(seed)
@@ -145,7 +145,7 @@ def shape_of_motion(
             lambda: activate(p.values, moments, smooth),
             views,
             loss,
-            Schedule(seconds=seconds - (clock() - start), steps=steps, seed=seed),
+            Schedule(seconds=seconds - (work_clock() - start), steps=steps, seed=seed),
             text="som",
             progress=progress,
         )

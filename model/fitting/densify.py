@@ -7,7 +7,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..gaussians import rotation_matrix
+from ..rotations import rotation_matrix
 from .parameters import Parameters, activate
 
 EVERY, UNTIL = 40, 0.6  # steps between densifications, and the share of the budget after which there are none

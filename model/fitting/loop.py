@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fitting a scene to its views by gradient descent, for a number of seconds: the loop that per-scene methods
-share. What the scene is made of, and how, is the caller's; any `Moving` scene or Gaussians4D will do."""
+share. What the scene is made of, and how, is the caller's; any `DynamicScene` scene or Gaussians4D will do."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..gaussians import Gaussians4D, Moving
-from ..parallel import clock
+from ..gaussians import DynamicScene, Gaussians4D
+from ..parallel import work_clock
 from ..rasterize import render
 from ..views import Views
 from .fit_views import downsampled, joined, reduction
@@ -53,7 +53,7 @@ class Step:
     alpha: Tensor  # (B,H,W)
     views: Views  # the B views that were drawn
     background: Tensor  # (3,)
-    scene: Gaussians4D | Moving
+    scene: Gaussians4D | DynamicScene
     fraction: float  # of the budget spent, 0..1
 
 
@@ -125,7 +125,7 @@ class _Report:
             self.progress(fraction, f"{self.text}, step {done}")
 
 
-def draw(scene: Gaussians4D | Moving, views: Views, background: Tensor, fraction: float) -> Step:
+def draw(scene: Gaussians4D | DynamicScene, views: Views, background: Tensor, fraction: float) -> Step:
     """The scene as the views' cameras see it over `background` (3,), with gradients."""
     height, width = views.size
     camera = (views.c2w, views.intrinsics, views.time, width, height)
@@ -135,7 +135,7 @@ def draw(scene: Gaussians4D | Moving, views: Views, background: Tensor, fraction
 
 def optimise(
     parameters: Parameters,
-    scene: Callable[[], Gaussians4D | Moving],
+    scene: Callable[[], Gaussians4D | DynamicScene],
     views: Views,
     loss: Callable[[Step], Tensor],
     schedule: Schedule,
@@ -154,10 +154,10 @@ def optimise(
     batches = _Batches(views, extra_views, schedule)
     if schedule.steps is None:
         warm_up(views.rgb.device.type)
-    start, done = clock(), 0
+    start, done = work_clock(), 0
     report = _Report(text, progress)
     while True:
-        elapsed = clock() - start
+        elapsed = work_clock() - start
         fraction = schedule.fraction(elapsed, done)
         report(fraction, elapsed, done)
         if fraction >= 1:

@@ -13,8 +13,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D, scale_rotation_from_covariance
+from ..gaussians import Gaussians4D
 from ..rasterize import render
+from ..rotations import scale_rotation_from_covariance
 from ..views import Views
 from .loop import gradients
 

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from ...datagen.sequence import InputError
-from ..gaussians import Gaussians4D, Moving
-from ..parallel import clock
+from ..gaussians import DynamicScene, Gaussians4D
+from ..parallel import work_clock
 from ..views import Views
 from .densify import Densifier
 from .fit_views import detached, downsampled, reduction, squared_error, validation_views, views_around
@@ -141,7 +141,7 @@ def part(progress, first: float, last: float):
 
 
 def refine(
-    start: Gaussians4D | Moving,
+    start: Gaussians4D | DynamicScene,
     views: Views,
     seconds: float,
     device: str = "cpu",
@@ -166,7 +166,7 @@ def refine(
     if (seconds == 0 and not steps) or not len(start) or too_few:
         return start
     warm_up(device)
-    began = clock()
+    began = work_clock()
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g = g[g.alive()].with_axes()
@@ -191,7 +191,7 @@ def refine(
         if merging:
             extra_views = views_around(g, views, seed) if has_depth else None
             schedule = Schedule(
-                seconds=max(seconds - (clock() - began), 0.5 * (1 - first) * seconds),
+                seconds=max(seconds - (work_clock() - began), 0.5 * (1 - first) * seconds),
                 steps=None if steps is None else steps - round(first * steps),
                 max_steps=few.max_steps,
                 coarse_size=max(-(-max(views.size) // 2), SMALL),

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Depth and motion vectors straight to 4D Gaussians, without a network.
 
-Every foreground pixel with depth becomes one Gaussian: its place from depth, its shape from the pixel's
-footprint on the surface, its velocity from the motion vectors, its lifetime from what the other views
-know (`follow.py`). The result is also what the depth-guided network starts from: `Geometry` keeps it per
-pixel.
+Every foreground pixel with depth becomes one Gaussian or several: its place from depth, its shape from the pixel's
+footprint on the surface, its velocity from the motion vectors, its lifetime from what the other views know
+(tracking.py). The result is also what the depth-guided network starts from: `Geometry` keeps it per pixel.
 """
 
 from __future__ import annotations
@@ -15,45 +14,45 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D, quaternion
+from ..gaussians import Gaussians4D
+from ..rotations import quaternion_from_matrix
 from ..views import Views, camera_rays
-from .tracking import Points, follow
+from .features import LIFT_FEATURES, SCALES, Features, Geometry, scaled_distance
+from .scene_flow import SurfacePoints
+from .tracking import track_points
 
-FOOTPRINT = 0.35  # σ of a Gaussian in pixels of the view that made it
-STRETCH = 2.5  # a slanted pixel's footprint grows at most by this
-THICKNESS = 0.15  # σ along the normal, in pixels
-INSET = 1.0  # how far below the surface a Gaussian sits, in pixels: its own width reaches back out to it
-OPACITY = 0.95
-LIFE = 0.6  # σ_t as a multiple of half a piece's length
-SHORTEST = 0.45  # least σ_t, in frames, where a network goes on from there: less, and it cannot close the gaps
-ALONE = 0.3  # the same without a network
-FEATURES = 12  # extra input channels that a Geometry carries
+MIN_ALPHA = 0.35  # pixels below it are background, or too mixed to have a depth
+EMPTY_ALPHA = 0.02  # pixels below it show that there is nothing along their ray
 
 
-@dataclass
-class Geometry:
-    """What is known of the pixels of V views before the network."""
+@dataclass(frozen=True)
+class LiftSettings:
+    """How a pixel becomes Gaussians."""
 
-    gaussians: Gaussians4D  # (M,) one or several per valid pixel: the pieces of its point's track
-    owner: Tensor  # (M,) the pixel that each belongs to, as an index into (V·H·W), ascending
-    slack: Tensor  # (V,H,W) how far along its ray the network may move it, normalised units
-    features: Tensor  # (V,H,W,FEATURES) extra input channels, zero where not valid
+    footprint: float = 0.35  # σ of a Gaussian in pixels of the view that made it
+    max_stretch: float = 2.5  # a slanted pixel's footprint grows at most by this
+    thickness: float = 0.15  # σ along the normal, in pixels
+    inset: float = 1.0  # how far below the surface a Gaussian sits, in pixels: its own width reaches back out to it
+    opacity: float = 0.95
+    lifetime: float = 0.6  # σ_t as a multiple of half a piece's length
+    min_sigma_t: float = 0.45  # in frames, where a network goes on from there: less, and it cannot close the gaps
 
-    def to(self, device) -> Geometry:
-        return Geometry(*(x.to(device) for x in vars(self).values()))
+
+BEFORE_NETWORK = LiftSettings()
+ALONE = LiftSettings(min_sigma_t=0.3)
 
 
 def lift(views: Views) -> Gaussians4D:
-    """Views with depth and flow -> (M,) Gaussians."""
+    """Views with depth and flow -> (M,) Gaussians. CPU tensors."""
     return lift_geometry(views, ALONE).gaussians
 
 
-def lift_geometry(views: Views, shortest: float = SHORTEST) -> Geometry:
-    """Views with depth and flow, least σ_t in frames -> Geometry. CPU tensors (the kernel that follows points is
+def lift_geometry(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Geometry:
+    """Views with depth and flow -> Geometry with LIFT_FEATURES. CPU tensors (the kernel that follows points is
     compiled)."""
     step = views.frame_step
     depth = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
-    valid = (views.alpha > 0.35) & (depth > 0)
+    valid = (views.alpha > MIN_ALPHA) & (depth > 0)
     ray = camera_rays(views.intrinsics, *views.size)
     pixel = depth / views.intrinsics[:, 0, None, None]  # a pixel's size at the surface
     point = ray * depth[..., None]
@@ -61,42 +60,52 @@ def lift_geometry(views: Views, shortest: float = SHORTEST) -> Geometry:
 
     view = valid.nonzero()[:, 0]
     R, ray, depth, pixel, point = views.c2w[view, :3, :3], ray[valid], depth[valid], pixel[valid], point[valid]
-    scale, axes = tangent_frame(*slopes, point, pixel)
+    scale, axes = tangent_frame(*slopes, point, pixel, settings)
     axes = R @ axes
+    normal = axes[..., 2]
     place = (R @ point[..., None])[..., 0] + views.c2w[view, :3, 3]
-    flow, alpha = views.flow[valid], views.alpha[valid]
-    points = Points(view, place, axes[..., 2], pixel, flow[:, :2], flow[:, 2:], depth, ray[:, :2])
+    to_next, to_previous = views.flow[valid].split(2, -1)
+    alpha = views.alpha[valid]
     # Pixels that mix object and background say nothing about depth.
-    seen = torch.where(views.alpha < 0.02, torch.inf, -1.0)
-    seen[valid] = depth
-    pieces, owner, summary = follow(views, points, seen)
+    observed = torch.where(views.alpha < EMPTY_ALPHA, torch.inf, -1.0)
+    observed[valid] = depth
+    points = SurfacePoints(view, place, normal, pixel, to_next, to_previous, depth, ray[:, :2])
+    pieces, of, summary = track_points(views, points, observed)
 
-    middle, half, place, velocity = pieces[:, 0], pieces[:, 1], pieces[:, 2:5], pieces[:, 5:8]
     gaussians = Gaussians4D(
-        xyz=place - INSET * (pixel[:, None] * points.normal)[owner],
-        t=middle * step,
-        velocity=velocity / step,
-        sigma_t=(LIFE * half).clamp_min(shortest) * step,
-        scale=scale[owner],
-        rotation=quaternion(axes)[owner],
-        rgb=views.rgb[valid][owner],
-        opacity=(OPACITY * alpha).clamp(1e-3, 0.99)[owner],
+        xyz=pieces.place - settings.inset * (pixel[:, None] * normal)[of],
+        t=pieces.time * step,
+        velocity=pieces.velocity / step,
+        sigma_t=(settings.lifetime * pieces.half_length).clamp_min(settings.min_sigma_t) * step,
+        scale=scale[of],
+        rotation=quaternion_from_matrix(axes)[of],
+        rgb=views.rgb[valid][of],
+        opacity=(settings.opacity * alpha).clamp(1e-3, 0.99)[of],
     )
-    motion = primary(owner, middle - (views.time / step)[view[owner]], velocity, len(view))
-    known = [(depth * ray.norm(dim=-1))[:, None] / 2.7 - 1, points.normal, 0.3 * motion / step]
-    known += [summary * torch.tensor([0.25, 0.25, 0.25, 1.0]), alpha[:, None]]
-    features = torch.zeros(*views.alpha.shape, FEATURES)
-    features[valid] = torch.cat(known, -1)
-    slack = torch.zeros_like(views.alpha)
-    slack[valid] = 2 * pixel
-    return Geometry(gaussians, valid.flatten().nonzero()[:, 0][owner], slack, features)
+    away = pieces.time - (views.time / step)[view[of]]
+    features = Features.build(
+        LIFT_FEATURES,
+        valid,
+        distance=scaled_distance(depth * ray.norm(dim=-1)),
+        normal=normal,
+        motion=SCALES.motion * nearest_in_time(of, away, pieces.velocity, len(view)) / step,
+        frames_before=SCALES.count * summary.frames_before,
+        frames_after=SCALES.count * summary.frames_after,
+        agreeing_views=SCALES.count * summary.agreeing_views,
+        contradicted=summary.contradicted,
+        alpha=alpha,
+    )
+    max_shift = torch.zeros_like(views.alpha)
+    max_shift[valid] = 2 * pixel
+    return Geometry(gaussians, valid.flatten().nonzero()[:, 0][of], max_shift, features)
 
 
-def primary(owner: Tensor, away: Tensor, values: Tensor, n: int) -> Tensor:
-    """values (M,C) of pieces -> (n,C): of each of the n owners' pieces the one with the least |away| (M)."""
+def nearest_in_time(of: Tensor, away: Tensor, values: Tensor, n: int) -> Tensor:
+    """values (M,C) of pieces, of (M,) the point 0..n-1 that each belongs to, away (M,) its time from the point's own
+    -> (n,C): those of each point's piece with the least |away|."""
     order = torch.argsort(away.abs(), descending=True, stable=True)
     out = torch.zeros(n, values.shape[1])
-    out.numpy()[owner[order].numpy()] = values[order].numpy()  # of several writes to one place the last holds
+    out.numpy()[of[order].numpy()] = values[order].numpy()  # of several writes to one place the last holds
     return out
 
 
@@ -114,7 +123,9 @@ def surface_slope(point: Tensor, valid: Tensor, pixel: Tensor, axis: int) -> Ten
     return torch.where(torch.isfinite(slope).all(-1, keepdim=True), slope, facing)
 
 
-def tangent_frame(du: Tensor, dv: Tensor, point: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+def tangent_frame(
+    du: Tensor, dv: Tensor, point: Tensor, pixel: Tensor, settings: LiftSettings = BEFORE_NETWORK
+) -> tuple[Tensor, Tensor]:
     """du, dv (…,3) surface steps per pixel, point (…,3) and pixel (…) -> scale (…,3) and axes (…,3,3): the
     ellipse that a round pixel is on the surface, and the normal (third axis, towards the camera)."""
     normal = torch.linalg.cross(dv, du)
@@ -129,6 +140,7 @@ def tangent_frame(du: Tensor, dv: Tensor, point: Tensor, pixel: Tensor) -> tuple
     axis = torch.where((pixel > 0)[..., None], axis, torch.tensor([1.0, 0, 0]))
     axis = torch.nn.functional.normalize(axis, dim=-1, eps=1e-20)
     normal = torch.where(normal.norm(dim=-1, keepdim=True) > 0.5, normal, torch.tensor([0.0, 0, -1.0]))
-    length = [torch.minimum(x.sqrt(), STRETCH * pixel) for x in (major, minor)]
-    scale = torch.stack([FOOTPRINT * length[0], FOOTPRINT * length[1], THICKNESS * pixel], -1)
+    length = [torch.minimum(x.sqrt(), settings.max_stretch * pixel) for x in (major, minor)]
+    sides = [settings.footprint * length[0], settings.footprint * length[1], settings.thickness * pixel]
+    scale = torch.stack(sides, -1)
     return scale.clamp_min(1e-5), torch.stack([axis, torch.linalg.cross(normal, axis), normal], -1)

@@ -17,56 +17,102 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..parallel import each, parts
+from ..parallel import chunks, parallel_for
 from ..views import Views, camera_rays
-from .lift import FEATURES, Geometry, lift_geometry
+from .features import SCALES, SWEEP_FEATURES, Features, Geometry, scaled_distance
+from .lift import MIN_ALPHA, lift_geometry
 
-CANDIDATES = 48  # distances along a ray, over its way through the unit box
-VOTERS = 16  # most views that judge a ray
-MEMORY = 1.5  # frames after which another view's word counts 1/e
-AGREE = 2.5  # agreement in colour is 1 / (1 + AGREE · squared distance)
-DENSITY = 0.5  # how much of the remaining ray an undisputed candidate takes
-ROUND, RIM = 1.35, 0.1  # where the sum of squared offsets from the silhouettes' middles ends an object, and how softly
-STIFF = 2.0  # weight of the object's acceleration (units per frame²) beside its distance from centroids' rays
-CROWD = 0.05  # how much later that end comes per full vote beyond two: the hull of many views is the object
-KNOTS = 96  # most steps of the object's path
-BLUR = 3  # passes of smoothing, with strides of 1, 2, 3 … pixels at 128 pixels a side
+
+class SweepSettings(NamedTuple):
+    """How rays are swept; the kernels take it as it is here, at compile time."""
+
+    candidates: int = 48  # distances along a ray, over its way through the unit box
+    colour_falloff: float = 2.5  # agreement in colour is 1 / (1 + colour_falloff · squared distance)
+    density: float = 0.5  # how much of the remaining ray an undisputed candidate takes
+    object_end: float = 1.35  # the sum of squared offsets from the silhouettes' middles at which an object ends, …
+    end_softness: float = 0.1  # … how softly, …
+    crowd: float = 0.05  # … and how much later per full vote beyond two: the hull of many views is the object
+
+
+class VoterSettings(NamedTuple):
+    """Which views judge a ray, and what is known of the object's path."""
+
+    most: int = 16  # views that judge a ray
+    memory: float = 1.5  # frames after which another view's vote counts 1/e
+    least: float = 0.045  # votes that count less are not heard
+    stiffness: float = 2.0  # weight of the object's acceleration (units per frame²) beside its distance from rays
+    max_knots: int = 96  # of the object's path
+
+
+SWEEP = SweepSettings()
+VOTERS = VoterSettings()
+SMOOTHING = 3  # passes, with strides of 1, 2, 3 … pixels at 128 pixels a side
 OPACITY = 0.75  # of the lift's: places are less sure, and several views overlap
+
+
+class _Voters(NamedTuple):
+    """Which n views judge the rays of each of V views."""
+
+    view_index: np.ndarray  # (V,n) the voter
+    vote: np.ndarray  # (V,n) how much it counts: 1 at the ray's own time, less the farther away
+    share: np.ndarray  # (V,n+1) the same, shared among voters of like direction; the ray's own view comes last
+    transform: np.ndarray  # (V,n,3,4) from the view's camera to the voter's, the object's path taken out
+
+
+class _Cameras(NamedTuple):
+    """Of V views, as the kernel takes them."""
+
+    c2w: np.ndarray  # (V,4,4)
+    intrinsics: np.ndarray  # (V,4) fx fy cx cy
+
+
+class _Depths(NamedTuple):
+    """What the kernel writes of each pixel, (V,H,W) float32."""
+
+    depth: np.ndarray
+    spread: np.ndarray
+    certainty: np.ndarray
+
+
+# The channels of a picture, side by side as the kernels read them.
+RED, GREEN, BLUE, LOG_ALPHA, EDGE_OFFSET = range(5)
 
 
 def sweep_depth(views: Views) -> tuple[Tensor, Tensor, Tensor]:
     """Views with alpha -> planar z (V,H,W), its standard deviation (V,H,W), and certainty (V,H,W) 0..1; zero
-    where alpha is below 0.35. Deterministic."""
+    where alpha is below MIN_ALPHA. Deterministic. CPU tensors."""
     return _swept(views)[:3]
 
 
 def sweep_geometry(views: Views) -> Geometry:
-    """Views with alpha -> Geometry per pixel: depth by `sweep_depth`, shape and lifetime as the lift has them
-    (slopes of the depth; as long as no other view sees the same place or through it), no motion of their own.
+    """Views with alpha -> Geometry with SWEEP_FEATURES: depth by `sweep_depth`, shape and lifetime as the lift has
+    them (slopes of the depth; as long as no other view sees the same place or through it), no motion of their own.
+    CPU tensors."""
+    depth, spread, certainty, edge_offset = _swept(views)
+    valid, flow = depth > 0, torch.zeros(*depth.shape, 4)
+    lifted = lift_geometry(replace(views, depth=torch.where(valid, depth, torch.inf), flow=flow))
+    lifted.gaussians.opacity = (OPACITY * lifted.gaussians.opacity).clamp_min(1e-3)
+    maps = {
+        "distance": scaled_distance(depth * camera_rays(views.intrinsics, *views.size).norm(dim=-1)),
+        "spread": spread,
+        "certainty": certainty,
+        "alpha": views.alpha,
+        "lifetime": (SCALES.count * expected_lifetime(views))[:, None, None].expand_as(depth),
+        "edge_offset": edge_offset,
+        **{k: lifted.features[k] for k in ("normal", "frames_before", "frames_after", "agreeing_views")},
+    }
+    features = Features.build(SWEEP_FEATURES, valid, **{k: m[valid] for k, m in maps.items()})
+    return Geometry(lifted.gaussians, lifted.pixel_index, 0.1 + 2 * spread, features)
 
-    Features: distance / 2.7 - 1, spread, certainty, alpha, a quarter of `relief`, normal (3, world, towards
-    the camera), roundness of the silhouette at the pixel, frames before and after that it is needed, agreeing
-    views (these three quartered)."""
-    depth, spread, certainty, rim = _swept(views)
-    flow = torch.zeros(*depth.shape, 4)
-    known = lift_geometry(replace(views, depth=torch.where(depth > 0, depth, torch.inf), flow=flow))
-    known.gaussians.opacity = (OPACITY * known.gaussians.opacity).clamp_min(1e-3)
-    distance = depth * camera_rays(views.intrinsics, *views.size).norm(dim=-1)
-    span = relief(views)[:, None, None].expand_as(depth)
-    maps = [distance / 2.7 - 1, spread, certainty, views.alpha, 0.25 * span]
-    maps += [*known.features[..., 1:4].unbind(-1), rim, *known.features[..., 7:10].unbind(-1)]
-    features = torch.where((depth > 0)[..., None], torch.stack(maps, -1), 0.0)
-    assert features.shape[-1] == FEATURES
-    return Geometry(known.gaussians, known.owner, 0.1 + 2 * spread, features)
 
-
-def relief(views: Views) -> Tensor:
+def expected_lifetime(views: Views) -> Tensor:
     """(V,) half the frames until another view looks from within 50 degrees of a view's direction: about how
     long what it sees must live. Between half a frame and six frames."""
     frame = views.time / views.frame_step
@@ -88,62 +134,63 @@ def centre_path(views: Views) -> Tensor:
     b = (A @ eye.double())[..., 0]
     frame = (views.time / views.frame_step).double()
     first, length = frame.amin(), float(frame.amax() - frame.amin())
-    n = min(math.ceil(length - 1e-3), KNOTS - 1) + 1  # knots, one a frame where that is not too many
+    n = min(math.ceil(length - 1e-3), VOTERS.max_knots - 1) + 1  # knots, one a frame where that is not too many
     place = (frame - first) * ((n - 1) / max(length, 1e-6))
     left = place.floor().long().clamp(0, max(n - 2, 0))
     part = (place - left)[:, None]
     eye_n = torch.eye(n, dtype=torch.float64)
     basis = (1 - part) * eye_n[left] + part * eye_n[(left + 1).clamp_max(n - 1)]
     rows = torch.einsum("vi,vrc->vric", basis, A).reshape(2 * len(views), 3 * n)
-    bend = STIFF * torch.diff(torch.diff(eye_n, dim=0), dim=0)
+    bend = VOTERS.stiffness * torch.diff(torch.diff(eye_n, dim=0), dim=0)
     system = torch.kron(bend.T @ bend + 1e-6 * eye_n, torch.eye(3, dtype=torch.float64)) + rows.T @ rows
     path = torch.linalg.solve(system, rows.T @ b.flatten()).reshape(n, 3)
     return (basis @ path).float()
 
 
-def _voters(views: Views) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which views judge the rays of each: index (V,n), weight by time (V,n), the same as a share among views
-    of like direction (V,n+1, the ray's own view last), and transforms (V,n,3,4) from a view's camera to the
-    other's, the object's path taken out."""
+def _voters(views: Views) -> _Voters:
     V = len(views)
     frame = views.time / views.frame_step
-    say = torch.exp(-(frame[:, None] - frame).abs() / MEMORY).masked_fill(torch.eye(V, dtype=torch.bool), 0.0)
-    say = torch.where(say > 0.045, say, 0.0)
+    vote = torch.exp(-(frame[:, None] - frame).abs() / VOTERS.memory)
+    vote = vote.masked_fill(torch.eye(V, dtype=torch.bool), 0.0)
+    vote = torch.where(vote > VOTERS.least, vote, 0.0)
     scattered = (torch.arange(V) * 0.618034) % 1  # of views equally near in time, some from all over the list
-    index = torch.argsort(say - 1e-3 * scattered, dim=1, descending=True, stable=True)[:, : min(VOTERS, V - 1)]
-    say = say.gather(1, index)
-    own = torch.cat([index, torch.arange(V)[:, None]], 1)
-    forward = views.c2w[own, :3, 2]
-    weight = torch.cat([say, torch.ones(V, 1)], 1)
+    order = torch.argsort(vote - 1e-3 * scattered, dim=1, descending=True, stable=True)
+    index = order[:, : min(VOTERS.most, V - 1)]
+    vote = vote.gather(1, index)
+    with_own = torch.cat([index, torch.arange(V)[:, None]], 1)
+    forward = views.c2w[with_own, :3, 2]
+    weight = torch.cat([vote, torch.ones(V, 1)], 1)
     share = weight / (weight[:, None] * (forward @ forward.mT) ** 2).sum(-1)
     centre = centre_path(views)
-    here = views.c2w[:, None].repeat(1, index.shape[1], 1, 1)
-    here[..., :3, 3] += centre[index] - centre[:, None]
-    return index, say, share, (torch.linalg.inv(views.c2w)[index] @ here)[..., :3, :]
+    moved = views.c2w[:, None].repeat(1, index.shape[1], 1, 1)
+    moved[..., :3, 3] += centre[index] - centre[:, None]
+    transform = (torch.linalg.inv(views.c2w)[index] @ moved)[..., :3, :]
+    return _Voters(*(np.ascontiguousarray(x.numpy()) for x in (index, vote, share, transform)))
 
 
 def _swept(views: Views) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """-> depth, spread, certainty, and the roundness of silhouettes, each (V,H,W)."""
+    """-> depth, spread, certainty, and the offset from the silhouettes' middles, each (V,H,W)."""
     alpha = views.alpha.numpy()
-    mask = alpha > 0.35
+    mask = alpha > MIN_ALPHA
     V, H, W = mask.shape
-    rim = np.ones(mask.shape, np.float32)
-    each([(i,) for i in range(V)], lambda i: _rims(mask[i], rim[i]))
-    silhouette = np.log(np.maximum(alpha, np.float32(0.02)))
-    pictures = np.concatenate([views.rgb.numpy(), silhouette[..., None], rim[..., None]], -1).astype(np.float32)
-    arrays = [np.ascontiguousarray(x.numpy()) for x in (*_voters(views), views.c2w, views.intrinsics)]
-    out = [np.zeros(mask.shape, np.float32) for _ in range(3)]
-    each(parts(V * H, 64), lambda a, b: _sweep(a, b, pictures, mask, *arrays, *out))
+    edge_offset = np.ones(mask.shape, np.float32)
+    parallel_for([(i,) for i in range(V)], lambda i: _edge_offsets(mask[i], edge_offset[i]))
+    log_alpha = np.log(np.maximum(alpha, np.float32(0.02)))
+    pictures = np.concatenate([views.rgb.numpy(), log_alpha[..., None], edge_offset[..., None]], -1).astype(np.float32)
+    cameras = _Cameras(*(np.ascontiguousarray(x.numpy()) for x in (views.c2w, views.intrinsics)))
+    voters = _voters(views)
+    out = _Depths(*(np.zeros(mask.shape, np.float32) for _ in _Depths._fields))
+    parallel_for(chunks(V * H, 64), lambda a, b: _sweep(a, b, pictures, mask, voters, cameras, out))
     depth, spread, certainty = out
-    for n in range(BLUR):
+    for n in range(SMOOTHING):
         stride, old = max(round((n + 1) * W / 128), 1), (depth, spread)
         depth, spread = depth.copy(), spread.copy()
-        each(parts(V * H, 256), lambda a, b: _smooth(a, b, stride, pictures, *old, depth, spread))  # noqa: B023
-    return tuple(map(torch.from_numpy, (depth, spread, certainty, rim)))
+        parallel_for(chunks(V * H, 256), lambda a, b: _smooth(a, b, stride, pictures, *old, depth, spread))  # noqa: B023
+    return tuple(map(torch.from_numpy, (depth, spread, certainty, edge_offset)))
 
 
 @numba.njit(cache=True, nogil=True)
-def _rims(mask, out):
+def _edge_offsets(mask, out):
     """mask (H,W) -> out: squared offset of each pixel from the middle of its run of set pixels, 0 there and 1
     at the rim, the greatest of the runs along rows, columns and diagonals; out holds 1 where not set."""
     H, W = mask.shape
@@ -167,14 +214,17 @@ def _rims(mask, out):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _sweep(begin, end, pictures, mask, other, say, share, across, c2w, K, depth, spread, certainty):
-    """Rows begin…end, counted through all views; pictures (V,H,W,5): colour, logarithm of alpha, rim."""
+def _sweep(begin, end, pictures, mask, voters, cameras, out):
+    """Sweeps the rays of the rows begin…end, counted through all views; pictures (V,H,W,5), mask (V,H,W)."""
+    voter, vote, share, transform = voters.view_index, voters.vote, voters.share, voters.transform
+    c2w, K = cameras.c2w, cameras.intrinsics
+    depth, spread, certainty = out.depth, out.spread, out.certainty
     H, W = mask.shape[1:]
-    count = other.shape[1]
+    count = voter.shape[1]
     direction, turned = np.empty(3, np.float32), np.empty((count + 1, 3), np.float32)
     for row in range(begin, end):
         i, v = row // H, row % H
-        end_of_object = np.float32(ROUND + CROWD * max(say[i].sum() - 2, 0))
+        end_of_object = np.float32(SWEEP.object_end + SWEEP.crowd * max(vote[i].sum() - 2, 0))
         for u in range(W):
             if not mask[i, v, u]:
                 continue
@@ -189,42 +239,42 @@ def _sweep(begin, end, pictures, mask, other, say, share, across, c2w, K, depth,
                 continue
             for n in range(count):
                 for k in range(3):
-                    turned[n, k] = across[i, n, k, 0] * x + across[i, n, k, 1] * y + across[i, n, k, 2]
-            red, green, blue = pictures[i, v, u, 0], pictures[i, v, u, 1], pictures[i, v, u, 2]
-            step = (far - near) / CANDIDATES
+                    turned[n, k] = transform[i, n, k, 0] * x + transform[i, n, k, 1] * y + transform[i, n, k, 2]
+            red, green, blue = pictures[i, v, u, RED], pictures[i, v, u, GREEN], pictures[i, v, u, BLUE]
+            step = (far - near) / SWEEP.candidates
             left, total, best = np.float32(1), np.float32(0), np.float32(0)
             mean, square = np.float32(0), np.float32(0)
-            for candidate in range(CANDIDATES):
+            for candidate in range(SWEEP.candidates):
                 z = near + (candidate + np.float32(0.5)) * step
                 inside, agree, votes = np.float32(0), np.float32(0), np.float32(0)
-                rims, shares = share[i, count] * pictures[i, v, u, 4], share[i, count]
+                offsets, shares = share[i, count] * pictures[i, v, u, EDGE_OFFSET], share[i, count]
                 for n in range(count):
-                    weight = say[i, n]
-                    zj = across[i, n, 2, 3] + z * turned[n, 2]
+                    weight = vote[i, n]
+                    zj = transform[i, n, 2, 3] + z * turned[n, 2]
                     if weight == 0 or zj < 0.01:
                         continue
-                    j, scale = other[i, n], 1 / zj
-                    uj = int(np.floor((across[i, n, 0, 3] + z * turned[n, 0]) * scale * K[j, 0] + K[j, 2]))
-                    vj = int(np.floor((across[i, n, 1, 3] + z * turned[n, 1]) * scale * K[j, 1] + K[j, 3]))
+                    j, scale = voter[i, n], 1 / zj
+                    uj = int(np.floor((transform[i, n, 0, 3] + z * turned[n, 0]) * scale * K[j, 0] + K[j, 2]))
+                    vj = int(np.floor((transform[i, n, 1, 3] + z * turned[n, 1]) * scale * K[j, 1] + K[j, 3]))
                     if uj < 0 or vj < 0 or uj >= W or vj >= H:
                         continue
                     seen = pictures[j, vj, uj]
-                    inside += weight * seen[3]
+                    inside += weight * seen[LOG_ALPHA]
                     if inside < -7:
                         break
-                    d = (seen[0] - red) ** 2 + (seen[1] - green) ** 2 + (seen[2] - blue) ** 2
-                    agree += weight / (1 + d * np.float32(AGREE))
+                    d = (seen[RED] - red) ** 2 + (seen[GREEN] - green) ** 2 + (seen[BLUE] - blue) ** 2
+                    agree += weight / (1 + d * np.float32(SWEEP.colour_falloff))
                     votes += weight
-                    rims += share[i, n] * seen[4]
+                    offsets += share[i, n] * seen[EDGE_OFFSET]
                     shares += share[i, n]
                 if inside < -7:
                     continue
                 hold = np.exp(inside)
                 if votes > 0:
                     hold *= np.float32(0.4) + np.float32(0.6) * agree / votes
-                hold /= 1 + np.exp((2 * rims / shares - end_of_object) / np.float32(RIM))
-                weight = left * np.float32(DENSITY) * hold
-                left *= 1 - np.float32(DENSITY) * hold
+                hold /= 1 + np.exp((2 * offsets / shares - end_of_object) / np.float32(SWEEP.end_softness))
+                weight = left * np.float32(SWEEP.density) * hold
+                left *= 1 - np.float32(SWEEP.density) * hold
                 total += weight
                 mean += weight * z
                 square += weight * z * z

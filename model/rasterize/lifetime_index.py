@@ -21,7 +21,7 @@ QUICKER_FROM = 400_000  # Gaussians; with fewer the rasteriser's own test of lif
 
 
 class LifetimeIndex:
-    """A moving scene (`Moving`) of N 4D Gaussians, without batch dimensions, that draws as they do with the inference
+    """A `DynamicScene` of N 4D Gaussians, without batch dimensions, that draws as they do with the inference
     filters on. bins: equal parts of the clip, at least 1."""
 
     def __init__(self, g: Gaussians4D, bins: int = CLIP_BINS):
@@ -48,5 +48,5 @@ class LifetimeIndex:
         return self.bins[min(k, len(self.bins) - 1)]
 
     def at(self, t: float) -> Gaussians4D:
-        """The Gaussians of t's bin as they are at time t in -1..1, for ever (`Moving`)."""
+        """The Gaussians of t's bin as they are at time t in -1..1, for ever (`DynamicScene`)."""
         return self.gaussians[self.candidates(t)].frozen(t)

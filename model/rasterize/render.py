@@ -8,7 +8,7 @@ import importlib
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D, Moving
+from ..gaussians import DynamicScene, Gaussians4D
 from ..views import BACKGROUND
 from . import gsplat
 from .inputs import Cameras, RenderOptions, check_shapes, colour
@@ -17,7 +17,7 @@ BACKENDS = ("cpu", "gsplat", "triton", "reference")  # modules of this package w
 
 
 def render(
-    scene: Gaussians4D | Moving,
+    scene: Gaussians4D | DynamicScene,
     c2w: Tensor,
     intrinsics: Tensor,
     time: Tensor,

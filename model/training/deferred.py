@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians4D, Moving
+from ..gaussians import DynamicScene, Gaussians4D
 from ..rasterize import render
 from ..views import Views
 
@@ -23,7 +23,7 @@ class DetachedScene:
     to the scene alone, which is detached from the network: what the rasteriser keeps is that of a few views, and no
     view is drawn twice."""
 
-    def __init__(self, scene: Moving):
+    def __init__(self, scene: DynamicScene):
         """scene: Gaussians4D, or another with a `map` over its tensors."""
         if isinstance(scene, Gaussians4D):  # the covariance is computed once, not once for every few views
             scene = replace(scene, cov3=scene.covariance3())

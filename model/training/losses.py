@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ..gaussians import Gaussians4D
-from ..geometry.lift import Geometry, lift_geometry
+from ..geometry.features import Geometry
+from ..geometry.lift import lift_geometry
 from ..network import Network
 from ..views import Views
 from .vgg import IMAGENET_STD, VGG, find_weights
@@ -100,16 +101,16 @@ def pixel_truth(network: Network, inputs: Views, geometry: Geometry | None) -> P
     geometry: what the network starts from, if anything."""
     lifted = lift_geometry(inputs)
     if geometry is not None:
-        owner = geometry.owner
+        owner = geometry.pixel_index
     else:
         row = network.rows(inputs, network.kept_patches(inputs))
         kept = (row >= 0).nonzero()[:, 0]
         owner = kept[torch.argsort(row[kept])]
     view_time = inputs.time[:, None, None].expand_as(inputs.alpha).flatten()
-    away = (lifted.gaussians.t - view_time[lifted.owner]).abs()
+    away = (lifted.gaussians.t - view_time[lifted.pixel_index]).abs()
     order = torch.argsort(away, descending=True, stable=True)
     piece = torch.full((len(view_time),), -1)
-    piece.numpy()[lifted.owner[order].numpy()] = order.numpy()  # of a pixel's pieces the one of its own time
+    piece.numpy()[lifted.pixel_index[order].numpy()] = order.numpy()  # of a pixel's pieces the one of its own time
     return PixelTruth(lifted.gaussians[piece[owner]], view_time[owner], piece[owner] >= 0)
 
 

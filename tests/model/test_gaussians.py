@@ -1,22 +1,14 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The two forms of a 4D Gaussian are one: closed forms against float64 linear algebra."""
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
-from timesplat.model.gaussians import (
-    Gaussians4D,
-    eigh3,
-    isoclinic_rotation,
-    kinematic_from_covariance,
-    paper_from_kinematic,
-    quaternion,
-    rotation_matrix,
-    scale_rotation_from_covariance,
-)
+from timesplat.model.gaussians import Gaussians4D, kinematic_from_covariance, paper_from_kinematic
 from timesplat.model.io.asset import Clip
+from timesplat.model.rotations import isoclinic_rotation
 
 
 def cloud(n: int, seed: int = 0, dtype=torch.float64) -> Gaussians4D:
@@ -67,62 +59,6 @@ def test_paper_form_and_back(seed):
     R = isoclinic_rotation(q_l, q_r)
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(4, dtype=R.dtype))
     torch.testing.assert_close((R * scale[:, None, :] ** 2) @ R.mT, g.covariance4(), rtol=1e-8, atol=1e-11)
-
-
-def test_isoclinic_rotation_is_the_papers_matrix_product():
-    """Entry by entry for q_l = i/√2 + 1/√2 and q_r = j: worked out by hand from the printed matrices."""
-    h = 0.5**0.5
-    R = isoclinic_rotation(torch.tensor([h, h, 0, 0]), torch.tensor([0.0, 0, 1, 0]))
-    L = torch.tensor([[h, -h, 0, 0], [h, h, 0, 0], [0, 0, h, -h], [0, 0, h, h]])
-    right = torch.tensor([[0.0, 0, -1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]])
-    torch.testing.assert_close(R, L @ right)
-
-
-@settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 2**31))
-def test_quaternion_inverts_rotation_matrix(seed):
-    q = normalize(torch.randn(8, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)), dim=-1)
-    back = quaternion(rotation_matrix(q))
-    torch.testing.assert_close((back * q).sum(-1).abs(), torch.ones(8, dtype=q.dtype))
-
-
-@pytest.mark.parametrize("q", [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0.5, 0.5, -0.5, 0.5]])
-def test_quaternion_of_half_turns(q):
-    q = torch.tensor(q, dtype=torch.float64)
-    torch.testing.assert_close((quaternion(rotation_matrix(q)) * q).sum().abs(), torch.ones((), dtype=q.dtype))
-
-
-def test_scale_and_rotation_rebuild_the_covariance():
-    cov = cloud(100).covariance3()
-    scale, q = scale_rotation_from_covariance(cov)
-    M = rotation_matrix(q) * scale[:, None, :]
-    torch.testing.assert_close(M @ M.mT, cov, rtol=1e-8, atol=1e-12)
-
-
-@settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 2**31), small=st.integers(-6, 0), middle=st.floats(0, 1))
-def test_closed_form_axes_are_lapacks(seed, small, middle):
-    """Of needles, discs, balls and all between; sides from 1 to 1e-6."""
-    generator = torch.Generator().manual_seed(seed)
-    R = rotation_matrix(normalize(torch.randn(16, 4, dtype=torch.float64, generator=generator), dim=-1))
-    sides = 10.0 ** torch.tensor([small, small * (1 - middle), 0.0], dtype=torch.float64)
-    sides = sides[torch.randperm(3, generator=generator)]
-    A = R @ torch.diag(sides) @ R.mT
-    A = 0.5 * (A + A.mT)
-    values, vectors = eigh3(A)
-    torch.testing.assert_close(values, torch.linalg.eigvalsh(A), rtol=1e-9, atol=1e-14)
-    torch.testing.assert_close(vectors @ torch.diag_embed(values) @ vectors.mT, A, rtol=0, atol=1e-14)
-    torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, dtype=A.dtype).expand_as(A), rtol=0, atol=1e-14)
-    torch.testing.assert_close(torch.linalg.det(vectors), torch.ones(16, dtype=A.dtype))
-
-
-@pytest.mark.parametrize("sides", [(1, 1, 1), (2, 2, 1), (1, 2, 2), (0, 0, 1), (0, 1, 1), (0, 0, 0), (3, 1, 2)])
-def test_axes_of_equal_and_no_sides(sides):
-    A = torch.diag(torch.tensor(sides, dtype=torch.float64))
-    values, vectors = eigh3(A)
-    assert values.tolist() == pytest.approx(sorted(sides), abs=1e-15)
-    torch.testing.assert_close(vectors @ torch.diag(values) @ vectors.mT, A, rtol=0, atol=1e-15)
-    assert float(torch.linalg.det(vectors)) == pytest.approx(1)
 
 
 def test_axes_are_derived_where_they_are_needed_and_not_before(monkeypatch):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The HexPlane variant: reading the planes by hand, motion from them, and what a scene must answer."""
 
 import pytest

@@ -1,4 +1,5 @@
-"""The transformer: sizes by hand, the appendix's activations, token dropping, and starting as the geometry."""
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The transformer: sizes by hand, token dropping, starting as the geometry, and shorter types."""
 
 import argparse
 import typing
@@ -12,7 +13,8 @@ from timesplat.model.gaussians import FIELDS
 from timesplat.model.geometry.lift import lift_geometry
 from timesplat.model.geometry.plane_sweep import sweep_geometry
 from timesplat.model.inference import geometry_for
-from timesplat.model.network import PRESETS, Config, Network, gather_pixels, load_matching, multiply, patch_rays
+from timesplat.model.network import PRESETS, Config, Network, load_matching
+from timesplat.model.patches import gather_pixels
 from timesplat.model.views import rays
 
 TINY = {"width": 32, "depth": 2, "heads": 2}
@@ -146,13 +148,14 @@ def test_temporal_alignment_fixes_the_time_alone(views, head, source):
     geometry = make(views) if make else None
     aligned = Network(Config(**TINY, head=head, source=source, time="aligned")).eval()
     free = Network(Config(**TINY, head=head, source=source)).eval()
-    n = free.config.outputs
+    n = free.config.free_layout.width
     assert aligned.decode.weight.shape[0] == 64 * (n - 1)
     torch.nn.init.normal_(aligned.decode.weight, std=0.1)
     state = aligned.state_dict()
     rows = aligned.decode.weight.detach().unflatten(0, (64, n - 1))
     zero = torch.zeros(64, 1, 32)
-    state["decode.weight"] = torch.cat([rows[:, :3], zero, rows[:, 3:]], 1).flatten(0, 1)
+    before, after = rows.split([free.config.pixel_layout.slice("t").start, n - 4], 1)
+    state["decode.weight"] = torch.cat([before, zero, after], 1).flatten(0, 1)
     free.load_state_dict(state)
     a, b = aligned(views, geometry), free(views, geometry)
     for k in ("xyz", "velocity", "sigma_t", "rgb", "opacity"):
@@ -207,45 +210,9 @@ def test_checkpointing_changes_no_gradient(views):
         assert torch.equal(a, b)
 
 
-def test_pixels_are_gathered_patch_by_patch():
-    x = torch.arange(2 * 4 * 6).reshape(2, 4, 6)
-    keep = torch.ones(2 * 2 * 3, dtype=torch.bool)
-    got = gather_pixels(x, keep, 2)
-    assert got.shape == (2 * 2 * 3, 4)
-    assert got[1].tolist() == [2, 3, 8, 9]  # first row of patches, second column
-    keep[0] = False
-    assert torch.equal(gather_pixels(x[..., None], keep, 2), got[1:, :, None])
-
-
-def test_rays_of_patches_are_those_of_the_pictures(views):
-    keep = Network(Config(**TINY)).kept_patches(views)
-    assert 0 < keep.sum() < len(keep)
-    whole = rays(views.c2w, views.intrinsics, *views.size)
-    for a, b in zip(patch_rays(views, keep, 8), whole, strict=True):
-        torch.testing.assert_close(a, gather_pixels(b, keep, 8), atol=1e-6, rtol=0)
-
-
 def test_odd_image_size_is_refused(spheres):
     with pytest.raises(ValueError, match="multiples of 8"):
         Network(Config(**TINY))(spheres([0], size=30))
-
-
-def test_quaternion_product_turns_first_by_the_second():
-    from timesplat.model.gaussians import rotation_matrix
-
-    a, b = torch.nn.functional.normalize(torch.randn(2, 7, 4, dtype=torch.float64), dim=-1)
-    torch.testing.assert_close(rotation_matrix(multiply(a, b)), rotation_matrix(a) @ rotation_matrix(b))
-
-
-def test_rows_lead_from_pixels_to_outputs(views):
-    """The output that a Gaussian is corrected by is the one of its own pixel."""
-    net = Network(Config(**TINY))
-    keep = net.kept_patches(views)
-    row = net.rows(views, keep)
-    number = torch.arange(3 * 32 * 32).reshape(3, 32, 32)
-    order = gather_pixels(number, keep, 8).flatten()
-    assert torch.equal(order[row[row >= 0]], (row >= 0).nonzero()[:, 0])
-    assert (row < 0).sum() == (~keep).sum() * 64
 
 
 @pytest.mark.parametrize("tokens", ["of zero weights", "any"])
@@ -260,7 +227,7 @@ def test_bfloat16_touches_the_transformer_alone(spheres, monkeypatch, head, sour
     if tokens == "any":
         torch.nn.init.normal_(net.decode.weight, std=0.2)
         found = torch.randn(int(net.kept_patches(views).sum()), TINY["width"])
-        monkeypatch.setattr(net, "transform", lambda x: (found, found[:0], found[:0]))
+        monkeypatch.setattr(net, "transform", lambda x: {"patches": found})
     else:
         for weights in net.parameters():
             torch.nn.init.zeros_(weights)
@@ -283,3 +250,10 @@ def test_bfloat16_is_used_inside_of_the_transformer(views):
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         net(views)
     assert kinds == [torch.bfloat16]
+
+
+def test_weights_have_the_names_of_the_checkpoints():
+    net = Network(Config(**TINY, free=3, motion="hexplane"))
+    names = {k.split(".")[0] for k in net.state_dict()}
+    expected = {"embed", "norm_in", "blocks", "norm_out", "decode", "free_tokens", "decode_free", "plane_tokens"}
+    assert names == expected | {"decode_planes", "deform"}

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """Cameras to rays, checked by projecting back, and padding that changes nothing that is seen."""
 
 import numpy as np

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...gaussians import Gaussians4D
-from ...parallel import each
+from ...parallel import parallel_for
 from ..inputs import Cameras, RenderOptions, check_finite
 from .blend import PLANE, blend_tiles, unblend_tiles
 from .chain_rule import chain_rule
@@ -46,7 +46,7 @@ class _Rasterize(torch.autograd.Function):
         tiles = -(-width // TILE) * -(-height // TILE)
         image, alpha = np.empty((views, height, width, 3), np.float32), np.empty((views, height, width), np.float32)
         kept = np.empty((views, tiles, TILE // ROWS, 2, PLANE), np.float32)
-        drawn = each(
+        drawn = parallel_for(
             [(c,) for c in range(views)],
             lambda c: project_view(c, inputs, cameras, width, height, inference),
         )  # per view: ids, P, starts, pairs, slots, first
@@ -55,7 +55,7 @@ class _Rasterize(torch.autograd.Function):
             _, P, starts, pairs, _, _ = drawn[c]
             blend_tiles(band, P, starts, pairs, background, image[c], alpha[c], kept[c])
 
-        each(itertools.product(range(views), _bands(width, height)), blend)
+        parallel_for(itertools.product(range(views), _bands(width, height)), blend)
         ctx.saved = inputs, cameras, size, background, drawn, kept
         dtype = tensors[0].dtype
         return torch.from_numpy(image).to(dtype), torch.from_numpy(alpha).to(dtype)
@@ -71,7 +71,7 @@ class _Rasterize(torch.autograd.Function):
             _, P, starts, pairs, slots, _ = drawn[c]
             unblend_tiles(band, P, starts, pairs, slots, background, g_image[c], g_alpha[c], kept[c], sums[c])
 
-        each(itertools.product(range(views), _bands(width, height)), unblend)
+        parallel_for(itertools.product(range(views), _bands(width, height)), unblend)
         out = tuple(None if x is None else np.zeros(x.shape, np.float32) for x in inputs)
         count, parts = len(inputs[1]), torch.get_num_threads()
 
@@ -80,7 +80,7 @@ class _Rasterize(torch.autograd.Function):
             for c, (ids, _, _, _, _, first) in enumerate(drawn):
                 chain_rule(c, own, ids, first, sums[c], inputs, cameras, width, height, out)
 
-        each([(k,) for k in range(parts)], chain_part)
+        parallel_for([(k,) for k in range(parts)], chain_part)
         return *[None] * 5, *map(_gradient, out, tensors)
 
 

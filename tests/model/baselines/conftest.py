@@ -7,7 +7,7 @@ import pytest
 @pytest.fixture(scope="session")
 def quality():
     """quality(scene, views) -> mean PSNR in dB of the scene's pictures."""
-    from timesplat.evaluation.metrics import psnr
+    from timesplat.evaluation.image_quality import psnr
     from timesplat.model.rasterize import render
 
     def measure(scene, views):

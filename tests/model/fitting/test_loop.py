@@ -48,7 +48,7 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
 def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatch):
     """Each step takes a second of this clock, what makes the kernels ready a minute."""
     now, told = [0.0], []
-    monkeypatch.setattr(module, "clock", lambda: now[0])
+    monkeypatch.setattr(module, "work_clock", lambda: now[0])
     monkeypatch.setattr(module, "warm_up", lambda device: now.append(now.pop() + 60))
     one = torch.ones(1)
     with gradients():

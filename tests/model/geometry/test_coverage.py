@@ -7,7 +7,7 @@ import torch
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import focal_from_fov, opengl_to_opencv
-from timesplat.model.geometry.coverage import around, coverage, unseen_space
+from timesplat.model.geometry.coverage import coverage, sphere_cameras, unseen_space
 from timesplat.model.geometry.lift import lift
 from timesplat.model.views import Views, rays
 
@@ -41,7 +41,7 @@ def test_what_four_level_cameras_do_not_see_of_a_box():
     """Its top and bottom: that share of all that cameras around it see, known from ray tracing them."""
     views = box(SIDES)
     found, per_time = coverage(lift(views), views)
-    c2w = around(12)
+    c2w = sphere_cameras(12)
     distance, side, _ = hit(c2w, torch.tensor([[focal_from_fov(50, 64)] * 2 + [32, 32]]).expand(12, 4), 64)
     truth = float((side[distance < 9] != 2).float().mean())
     assert 0.6 < truth < 0.8

@@ -1,4 +1,5 @@
-"""The lift on a scene known by hand: places, velocities, lifetimes, and pictures."""
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The lift on a scene known by hand: places, velocities, footprints, and pictures."""
 
 import numpy as np
 import pytest
@@ -8,11 +9,8 @@ from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import opengl_to_opencv
 from timesplat.evaluation.image_quality import psnr
 from timesplat.evaluation.scoring import draw
-from timesplat.model.gaussians import rotation_matrix
-from timesplat.model.geometry import lift as lift_module
-from timesplat.model.geometry import tracking as follow_module
-from timesplat.model.geometry.lift import lift, lift_geometry, tangent_frame
-from timesplat.model.geometry.tracking import EXTENT, GRID, Points, constraints, scene_flow
+from timesplat.model.geometry.lift import LiftSettings, lift, lift_geometry, tangent_frame
+from timesplat.model.rotations import rotation_matrix
 from timesplat.model.views import Views, load_views, rays
 
 FRAMES = list(range(24))
@@ -25,19 +23,18 @@ def views(spheres):
 
 def own_piece(geometry, views):
     """For each pixel with Gaussians: the one of its own time -> pixel index, Gaussians."""
-    view_time = views.time[:, None, None].expand_as(views.alpha).flatten()[geometry.owner]
+    view_time = views.time[:, None, None].expand_as(views.alpha).flatten()[geometry.pixel_index]
     away = (geometry.gaussians.t - view_time).abs()
     best = {}
-    for k, (pixel, a) in enumerate(zip(geometry.owner.tolist(), away.tolist(), strict=True)):
+    for k, (pixel, a) in enumerate(zip(geometry.pixel_index.tolist(), away.tolist(), strict=True)):
         if pixel not in best or a < best[pixel][0]:
             best[pixel] = (a, k)
     pixels = torch.tensor(list(best))
     return pixels, geometry.gaussians[torch.tensor([k for _, k in best.values()])]
 
 
-def test_places_at_the_views_own_time_are_on_the_surface(views, monkeypatch):
-    monkeypatch.setattr(lift_module, "INSET", 0.0)
-    pixels, g = own_piece(lift_geometry(views), views)
+def test_places_at_the_views_own_time_are_on_the_surface(views):
+    pixels, g = own_piece(lift_geometry(views, LiftSettings(inset=0.0)), views)
     here = g.position(views.time[:, None, None].expand_as(views.alpha).flatten()[pixels])
     origin, direction = rays(views.c2w, views.intrinsics, *views.size)
     forward = views.c2w[:, None, None, :3, 2]
@@ -58,31 +55,6 @@ def test_velocities_match_the_true_motion_in_all_three_directions(spheres, views
     assert np.percentile(error, 90) < 0.02
 
 
-def test_scene_flow_is_exact_where_two_sides_see_one_motion(spheres, monkeypatch):
-    """Two perpendicular views of one rigid motion: the least squares have one answer."""
-    monkeypatch.setattr(follow_module, "SLIDE", 1e-6)
-    monkeypatch.setattr(follow_module, "SPIN", 1e-6)
-    views = spheres([5, 5], [(0, 0), (90, 0)])
-    torch.manual_seed(0)
-    n, turn = 400, torch.tensor([0.05, 0.02, -0.04])
-    place, view = torch.rand(n, 3) * 0.2 + 0.1, torch.arange(n) % 2
-    motion = torch.tensor([0.02, -0.01, 0.03]) + torch.linalg.cross(turn.expand(n, 3), place)
-    w2c = torch.linalg.inv(views.c2w)[view]
-
-    def project(p):
-        local = (w2c[:, :3, :3] @ p[..., None])[..., 0] + w2c[:, :3, 3]
-        return local[:, :2] / local[:, 2:], local[:, 2]
-
-    ray, depth = project(place)
-    f = views.intrinsics[0, 0]
-    to_next, to_previous = ((project(place + k * motion)[0] - ray) * f for k in (1, -1))
-    points = Points(view, place, place, depth / f, to_next, to_previous, depth, ray)
-    field = scene_flow(views, points, *constraints(views, points), 23)
-    cell = ((place / EXTENT + 1) * GRID / 2).long()
-    v, spin = field[5][tuple(cell.T)].split(3, -1)
-    torch.testing.assert_close(v + torch.linalg.cross(spin, place), motion, atol=1e-3, rtol=0)
-
-
 @pytest.fixture(scope="module")
 def dancer(tmp_path_factory):
     """A procedural object, turning as it dances, rendered at 64x64 by four cameras in turn: its Views, and
@@ -92,20 +64,15 @@ def dancer(tmp_path_factory):
     from mathutils import Vector
     from mathutils.bvhtree import BVHTree
 
-    from timesplat.datagen import rigs
-    from timesplat.datagen.capture import Subject, capture
-    from timesplat.datagen.render_setup import CaptureSettings
-    from timesplat.datagen.scene.measure import normalisation
-    from timesplat.datagen.scene.open import empty_session
-    from timesplat.datagen.zoo.build import build_object
+    from timesplat.datagen import capture, rigs, scene, zoo
 
-    empty_session()
-    build_object(900002)
+    scene.empty()
+    zoo.build(900002)
     frames = list(range(1, 25))
-    norm, _ = normalisation(frames)
+    norm, _ = scene.normalisation(frames)
     out = tmp_path_factory.mktemp("dancer") / "zoo"
     shots = rigs.alternating(list(range(24)))
-    seq = capture(shots, out, Subject(frames, norm), CaptureSettings(size=64, samples=4))
+    seq = capture.capture(shots, out, frames=frames, normalisation=norm, size=64, samples=4)
     mesh = bpy.data.meshes["zoo_900002"]
     mesh.calc_loop_triangles()
     triangles = np.array([t.vertices for t in mesh.loop_triangles])
@@ -125,14 +92,13 @@ def dancer(tmp_path_factory):
         weights = np.concatenate([1 - weights.sum(1, keepdims=True), weights], 1)
         return np.einsum("nc,fncx->fnx", weights, posed[:, corners])
 
-    return load_views(seq, range(24), has_depth=True), track
+    return load_views(seq, range(24), passes=True), track
 
 
-def test_velocities_and_later_places_are_those_of_the_mesh(dancer, monkeypatch):
+def test_velocities_and_later_places_are_those_of_the_mesh(dancer):
     """Blender's renders in, Blender's mesh as truth: errors in pixels, per frame, of what moves by 1 to 5."""
-    monkeypatch.setattr(lift_module, "INSET", 0.0)
     views, track = dancer
-    geometry, step = lift_geometry(views), views.frame_step
+    geometry, step = lift_geometry(views, LiftSettings(inset=0.0)), views.frame_step
     pixels, g = own_piece(geometry, views)
     pixels, g = pixels[::5], g[::5]
     view = pixels // 64**2
@@ -148,10 +114,10 @@ def test_velocities_and_later_places_are_those_of_the_mesh(dancer, monkeypatch):
         past, next_ = truth[f] - truth[f - 1], truth[f + 1] - truth[f]
         true_velocity = np.where(side > 0.1, next_, np.where(side < -0.1, past, (past + next_) / 2))
         # Of each pixel the piece that is strongest one frame later.
-        after, owned = views.time[f] + step, torch.isin(geometry.owner, pixels[here])
-        pieces, owner = geometry.gaussians[owned], geometry.owner[owned]
+        after, owned = views.time[f] + step, torch.isin(geometry.pixel_index, pixels[here])
+        pieces, of = geometry.gaussians[owned], geometry.pixel_index[owned]
         order = torch.argsort(pieces.marginal(after), stable=True)
-        last = {int(owner[k]): k for k in order}
+        last = {int(of[k]): k for k in order}
         best = pieces[torch.stack([last[int(p)] for p in pixels[here]])]
         alive = (best.marginal(after) > 0.3).numpy()
         error = np.linalg.norm(best.position(after).numpy() - truth[f + 1], axis=-1)
@@ -168,12 +134,6 @@ def test_velocities_and_later_places_are_those_of_the_mesh(dancer, monkeypatch):
         found = np.nanpercentile(x[inner], [50, 95])
         assert found[0] < median and found[1] < most
     assert np.median(moved[inner]) > 1
-
-
-def test_a_side_seen_often_lives_shorter(spheres):
-    often = lift(spheres(FRAMES)).sigma_t.median()
-    seldom = lift(spheres(FRAMES[::3], [(90 * i, 0) for i in range(8)])).sigma_t.median()
-    assert seldom > 1.5 * often
 
 
 def test_novel_views_beat_a_lift_that_stands_still(spheres, views):
@@ -210,12 +170,12 @@ def test_footprints_on_a_slanted_square():
     depth = torch.where(hit, distance * (direction * c2w[:, None, None, :3, 2]).sum(-1), torch.inf)
     views = Views(torch.ones(1, 64, 64, 3), hit.float(), c2w, K, torch.zeros(1), 2.0, depth, torch.zeros(1, 64, 64, 4))
     geometry = lift_geometry(views)
-    g, owner = geometry.gaussians, geometry.owner
+    g, pixel = geometry.gaussians, geometry.pixel_index
     axes = rotation_matrix(g.rotation)
     assert (axes[..., 1, 2] < -0.9999).all()  # towards the camera
-    size = depth.flatten()[owner] / 70
-    slant = 1 / direction.reshape(-1, 3)[owner, 1]
-    centre = (direction.reshape(-1, 3)[owner] @ c2w[0, :3, 2]) > 0.995  # where a pixel is round
+    size = depth.flatten()[pixel] / 70
+    slant = 1 / direction.reshape(-1, 3)[pixel, 1]
+    centre = (direction.reshape(-1, 3)[pixel] @ c2w[0, :3, 2]) > 0.995  # where a pixel is round
     assert centre.sum() > 50
     torch.testing.assert_close(g.scale[centre, 0], (0.35 * size * slant)[centre], rtol=0.04, atol=0)
     torch.testing.assert_close(g.scale[centre, 1], (0.35 * size)[centre], rtol=0.04, atol=0)

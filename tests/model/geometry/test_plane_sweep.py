@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
 """The sweep against exact depth and motion, and its independence of what only a renderer knows."""
 
 import pytest
 import torch
 
-from timesplat.model.geometry.plane_sweep import centre_path, relief, sweep_depth, sweep_geometry
+from timesplat.model.geometry.plane_sweep import centre_path, expected_lifetime, sweep_depth, sweep_geometry
 
 
 def errors(views):
@@ -57,7 +58,7 @@ def test_motion_of_the_whole_object_is_taken_out(spheres):
 def test_one_view_alone(spheres):
     geometry = sweep_geometry(spheres([5]))
     assert len(geometry.gaussians) > 0
-    for x in (geometry.gaussians.xyz, geometry.gaussians.sigma_t, geometry.features, geometry.slack):
+    for x in (geometry.gaussians.xyz, geometry.gaussians.sigma_t, geometry.features.values, geometry.max_shift):
         assert torch.isfinite(x).all()
 
 
@@ -66,8 +67,8 @@ def test_it_uses_pictures_alone(spheres):
     blind.depth = blind.flow = None
     a, b = sweep_geometry(views), sweep_geometry(blind)
     torch.testing.assert_close(a.gaussians.xyz, b.gaussians.xyz, rtol=0, atol=0)
-    assert torch.isfinite(a.gaussians.xyz).all() and torch.isfinite(a.features).all()
+    assert torch.isfinite(a.gaussians.xyz).all() and torch.isfinite(a.features.values).all()
 
 
-def test_relief_of_alternating_views_is_half_their_period(spheres):
-    torch.testing.assert_close(relief(spheres(list(range(24)))), torch.full((24,), 2.0))
+def test_lifetime_in_alternating_views_is_half_their_period(spheres):
+    torch.testing.assert_close(expected_lifetime(spheres(list(range(24)))), torch.full((24,), 2.0))

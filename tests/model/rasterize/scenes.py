@@ -13,8 +13,9 @@ import torch
 
 from timesplat.datagen.rigs import look_at
 from timesplat.datagen.sequence import opengl_to_opencv
-from timesplat.model.gaussians import Gaussians4D, rotation_matrix
+from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.rasterize import render
+from timesplat.model.rotations import rotation_matrix
 
 FIELDS = ("xyz", "t", "velocity", "sigma_t", "cov3", "rgb", "opacity")  # what defines a `cloud`
 # c2w, intrinsics, time, width, height of a camera that looks along +z

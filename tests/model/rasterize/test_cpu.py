@@ -60,7 +60,11 @@ def test_kernels_are_compiled_again_when_a_file_they_share_changes(tmp_path):
     """By itself numba's cache looks only at the file that a function is in."""
     folder = tmp_path / "model" / "rasterize"
     shutil.copytree(Path(package.__file__).parent, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    for name, stub in (("gaussians", "Gaussians4D = Moving"), ("views", "BACKGROUND"), ("parallel", "each")):
+    for name, stub in (
+        ("gaussians", "Gaussians4D = DynamicScene"),
+        ("views", "BACKGROUND"),
+        ("parallel", "parallel_for"),
+    ):
         (tmp_path / "model" / f"{name}.py").write_text(f"{stub} = None")
     code = """
 import importlib, numpy

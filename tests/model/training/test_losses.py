@@ -43,7 +43,7 @@ def test_the_truth_of_pixels_is_their_lift(spheres):
     inputs = spheres([0, 1], size=16)
     lifted = lift_geometry(inputs)
     truth = pixel_truth(Network(Config(width=32, depth=1, heads=2, source="given")), inputs, lifted)
-    assert len(truth) == len(lifted.owner) and truth.known.all()
+    assert len(truth) == len(lifted.pixel_index) and truth.known.all()
     assert set(truth.view_time.tolist()) == set(inputs.time.tolist())
     mine, others = lifted.gaussians, lifted.gaussians[torch.arange(len(truth)).flip(0)]
     assert float(geometric_loss(mine, truth)) < 0.01 < 0.1 < float(geometric_loss(others, truth))
