@@ -22,11 +22,11 @@ TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 LAYERS = {
     "model": (
         ("model.io",),
-        ("model.parallel", "model.rotations", "model.devices"),
+        ("model.parallel", "model.rotations", "model.devices", "model.layout"),
         ("model.gaussians", "model.views", "model.clip"),
         ("model.rasterize",),
         ("model.geometry",),
-        ("model.network", "model.hexplane"),
+        ("model.patches", "model.heads", "model.hexplane", "model.network"),
         ("model.checkpoints_io", "model.inference"),
         ("model.fitting",),
         ("model.methods",),
