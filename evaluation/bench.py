@@ -223,7 +223,7 @@ def _other_weights() -> list[str]:
     from ..model.checkpoints_io import CHECKPOINTS
     from ..model.methods import METHODS
 
-    names = [(n, METHODS[n].checkpoint) for n in ("guided", "rgb", "predicted")]
+    names = [(n, METHODS[n].checkpoint or n) for n in ("guided", "rgb", "predicted")]
     return [f"{n}@{f.stem[len(w) + 1 :]}" for n, w in names for f in sorted(CHECKPOINTS.glob(f"{w}-*.safetensors"))]
 
 

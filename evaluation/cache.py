@@ -17,7 +17,7 @@ from tqdm import tqdm
 from ..datagen.farm import render_assets
 from ..datagen.render_job import RenderSettings
 from ..datagen.sequence import Sequence, read_sequence, sequences_in
-from ..model.gaussians import FIELDS, DynamicScene, Gaussians4D
+from ..model.gaussians import FIELDS, Gaussians4D, ReconstructedScene
 
 
 class Cache:
@@ -85,7 +85,7 @@ class Cache:
         path = self._scene_path(key)
         return Gaussians4D(**load_file(path)) if path.is_file() else None
 
-    def keep_scene(self, key: str, scene: Gaussians4D | DynamicScene) -> None:
+    def keep_scene(self, key: str, scene: Gaussians4D | ReconstructedScene) -> None:
         """Keeps a scene of 4D Gaussians, whole or not at all; other kinds are not kept."""
         if not isinstance(scene, Gaussians4D):
             return

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..datagen.sequence import InputError, Sequence
+from ..datagen.sequence import Sequence
 from ..model.clip import clip_of
-from ..model.gaussians import DynamicScene, Gaussians4D
+from ..model.gaussians import DynamicScene, Gaussians4D, ReconstructedScene
 from ..model.geometry.coverage import coverage
 from ..model.io.ply import write_ply
 from ..model.methods import METHODS, ReconstructOptions
@@ -28,7 +28,7 @@ from .metrics import Pictures, measure, summarise
 
 def reconstruct(
     views: Views, method: MethodSpec, device: str = "cpu", seconds: float = 10.0
-) -> Gaussians4D | DynamicScene:
+) -> Gaussians4D | ReconstructedScene:
     """The scene that a method makes of views (with depth and flow where it sees them), unfiltered; `seconds` for a
     method that fits the scene and names none."""
     with torch.no_grad():  # methods that fit a scene turn gradients on again
@@ -46,24 +46,25 @@ def reconstruct(
         )
 
 
-def draw(scene: Gaussians4D | DynamicScene, views: Views) -> tuple[Tensor, Tensor]:
+def draw(scene: Gaussians4D | ReconstructedScene, views: Views) -> tuple[Tensor, Tensor]:
     """Pictures (C,H,W,3) over white and alpha (C,H,W) of the scene from the cameras and times of views, with the
     paper's inference filters."""
     height, width = views.size
+    drawn: Gaussians4D | DynamicScene = scene
     if isinstance(scene, Gaussians4D) and len(scene) > QUICKER_FROM:
-        scene = LifetimeIndex(scene)
+        drawn = LifetimeIndex(scene)
     with torch.no_grad():
-        return render(scene, views.c2w, views.intrinsics, views.time, width, height, inference=True)
+        return render(drawn, views.c2w, views.intrinsics, views.time, width, height, inference=True)
 
 
-def score(scene: Gaussians4D | DynamicScene, truth: Truth, left_out: tuple[str, ...] = ()) -> dict[str, list]:
+def score(scene: Gaussians4D | ReconstructedScene, truth: Truth, left_out: tuple[str, ...] = ()) -> dict[str, list]:
     """`metrics.measure` of the scene's pictures of the views of truth."""
     return measure(Pictures(*draw(scene, truth.views), truth), left_out)
 
 
 def evaluate_views(
     views: Views, method: MethodSpec, truth: Truth, device: str = "cpu", left_out: tuple[str, ...] = ()
-) -> tuple[dict, Gaussians4D | DynamicScene]:
+) -> tuple[dict, Gaussians4D | ReconstructedScene]:
     """Reconstructs from views and scores -> a row: `metrics.summarise` of the scores, which are in `frames`; seconds
     of the reconstruction and of drawing and scoring a view; how many Gaussians there are, and are kept by the
     filters. And the scene, of those kept, on the processor."""
@@ -80,7 +81,9 @@ def evaluate_views(
 COSTS = ("ply_mb", "usd_mb", "render_ms", "coverage")
 
 
-def costs(scene: Gaussians4D | DynamicScene, views: Views, truth: Truth, method: MethodSpec, seq: Sequence) -> dict:
+def costs(
+    scene: Gaussians4D | ReconstructedScene, views: Views, truth: Truth, method: MethodSpec, seq: Sequence
+) -> dict:
     """COSTS: megabytes of the scene as .ply and, where pxr is installed, as .usdc (None of a scene that no asset can
     hold); milliseconds to draw a view; the share of the object that the input views show, where it can be told."""
     start = work_clock()
@@ -88,17 +91,17 @@ def costs(scene: Gaussians4D | DynamicScene, views: Views, truth: Truth, method:
     drawing = 1000 * (work_clock() - start) / len(truth.picture)
     known = METHODS[method.method].knows_surface and not (method.refine or method.budget or method.dense)
     sizes = megabytes(scene, seq)
-    return dict(zip(COSTS, (*sizes, drawing, coverage(scene, views)[0] if known else None), strict=True))
+    covered = coverage(scene, views)[0] if known and isinstance(scene, Gaussians4D) else None
+    return dict(zip(COSTS, (*sizes, drawing, covered), strict=True))
 
 
-def megabytes(scene: Gaussians4D | DynamicScene, seq: Sequence) -> tuple[float | None, float | None]:
+def megabytes(scene: Gaussians4D | ReconstructedScene, seq: Sequence) -> tuple[float | None, float | None]:
     """Of the scene as .ply and, where pxr is installed, as .usdc."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         ply, usd = Path(folder) / "a.ply", Path(folder) / "a.usdc"
-        try:
-            asset = scene.to_asset(clip_of(seq))
-        except InputError:
+        if not isinstance(scene, Gaussians4D):
             return None, None
+        asset = scene.to_asset(clip_of(seq))
         write_ply(ply, asset)
         if find_spec("pxr"):
             from ..model.io.usd_write import write_usd

@@ -29,6 +29,16 @@ class DynamicScene(Protocol):
         """How many Gaussians there are."""
 
 
+class ReconstructedScene(DynamicScene, Protocol):
+    """One that a method made of views: what is never seen can be told and left out."""
+
+    def __getitem__(self, index) -> ReconstructedScene:
+        """Index or mask of Gaussians."""
+
+    def alive(self) -> Tensor:
+        """(N,) bool: whether the paper's inference filters let the Gaussian through at some time of the clip."""
+
+
 @dataclass
 class Gaussians4D:
     """N Gaussians; every field may carry the same leading batch dimensions `…`. Activated, linear values."""

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from ..datagen.sequence import InputError
-from .gaussians import DynamicScene, Gaussians4D
+from .gaussians import Gaussians4D, ReconstructedScene
 from .views import Views
 
 
@@ -48,7 +48,7 @@ class Method:
     name: str
     about: str  # what it is and whose
     # (views, options, progress): options.checkpoint is what to load, progress is called by what takes seconds
-    run: Callable[[Views, ReconstructOptions, Progress | None], Gaussians4D | DynamicScene]
+    run: Callable[[Views, ReconstructOptions, Progress | None], Gaussians4D | ReconstructedScene]
     has_depth: bool = False  # sees depth and motion vectors; else RGB and alpha alone
     fits: bool = False  # to the scene, for some seconds
     baseline: bool = False  # what the product is compared with

@@ -10,7 +10,7 @@ import torch
 from ..datagen.sequence import InputError, Sequence
 from .checkpoints_io import CHECKPOINTS
 from .devices import fitting_device
-from .gaussians import DynamicScene, Gaussians4D
+from .gaussians import Gaussians4D, ReconstructedScene
 from .methods import Progress, ReconstructOptions, method_named
 from .views import Views, load_views
 
@@ -23,7 +23,7 @@ def reconstruct(
     indices=None,
     options: ReconstructOptions = DEFAULTS,
     progress: Progress | None = None,
-) -> Gaussians4D | DynamicScene:
+) -> Gaussians4D | ReconstructedScene:
     """Views `indices` of the Sequence (all of them by default) -> the scene (N,), Gaussians filtered out that the
     paper's inference filters would never draw. `progress(fraction, text)` is called between steps.
 
@@ -45,7 +45,7 @@ def reconstruct(
 
 def reconstruct_views(
     views: Views, method: str, options: ReconstructOptions = DEFAULTS, progress: Progress | None = None
-) -> Gaussians4D | DynamicScene:
+) -> Gaussians4D | ReconstructedScene:
     """The same from tensors; unfiltered. `progress(fraction, text)` is called by what takes seconds."""
     chosen = method_named(method)
     if chosen.checkpoint and not options.checkpoint:

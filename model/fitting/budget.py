@@ -14,7 +14,7 @@ import re
 import torch
 
 from ...datagen.sequence import InputError
-from ..gaussians import DynamicScene, Gaussians4D
+from ..gaussians import Gaussians4D, ReconstructedScene
 from ..views import Views
 from .fit_views import detached, squared_error, validation_views, views_around
 from .loop import Schedule, gradients
@@ -42,7 +42,7 @@ def parse_budget(text: str) -> int | float | None:
 
 
 def apply_budget(
-    start: Gaussians4D | DynamicScene,
+    start: Gaussians4D | ReconstructedScene,
     views: Views,
     budget: str,
     seconds: float = 0.0,

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ...datagen.sequence import InputError
-from ..gaussians import DynamicScene, Gaussians4D
+from ..gaussians import Gaussians4D, ReconstructedScene
 from ..parallel import work_clock
 from ..views import Views
 from .densify import Densifier
@@ -141,7 +141,7 @@ def part(progress, first: float, last: float):
 
 
 def refine(
-    start: Gaussians4D | DynamicScene,
+    start: Gaussians4D | ReconstructedScene,
     views: Views,
     seconds: float,
     device: str = "cpu",

@@ -108,7 +108,7 @@ def static_asset(source: str | Path, xyz, scale, rotation, rgb, opacity) -> Asse
     n = len(xyz)
     arrays = {"xyz": xyz, "t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
     arrays |= {"scale": scale, "rotation": rotation, "rgb": rgb, "opacity": opacity}
-    asset = Asset(**{k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()})
+    asset = Asset(**{k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()}, clip=Clip())
     check(asset, source)
     return asset
 

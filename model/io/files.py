@@ -69,17 +69,18 @@ def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: 
     opacity, at the neighbouring ones exp(-4.5) = 1.1 % of it, which is below VISIBLE, and half-way between
     two frames 32 %, so that both files are seen faintly. Raises InputError, also where files are 4D already
     or differ in their up axis."""
-    paths = sorted(map(Path, paths), key=_natural_order)
-    if not paths:
+    files = sorted(map(Path, paths), key=_natural_order)
+    if not files:
         raise InputError("No file was chosen; choose the .ply files of a sequence.")
-    if len(paths) == 1:
-        return _read_file(paths[0])
-    if any(path.suffix.lower() in USD_SUFFIXES for path in paths):
+    if len(files) == 1:
+        return _read_file(files[0])
+    if any(path.suffix.lower() in USD_SUFFIXES for path in files):
         raise InputError("USD files hold their frames themselves; import them one by one.")
-    clip = Clip(fps, frame_start, frame_start + len(paths) - 1)
-    sigma_t = np.float32(ONE_FRAME_SIGMA * 2 / (len(paths) - 1))
-    parts, ups, notes, total = [], set(), [], 0
-    for frame, path in zip(clip.frames, paths, strict=True):
+    clip = Clip(fps, frame_start, frame_start + len(files) - 1)
+    sigma_t = np.float32(ONE_FRAME_SIGMA * 2 / (len(files) - 1))
+    parts: list[Asset] = []
+    ups, notes, total = set(), [], 0
+    for frame, path in zip(clip.frames, files, strict=True):
         loaded = _read_file(path)
         asset, n = loaded.asset, len(loaded.asset)
         total += n
@@ -94,7 +95,7 @@ def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: 
         own = np.full(n, clip.frame_to_time(frame), np.float32)
         parts.append(replace(asset, t=own, sigma_t=np.full(n, sigma_t)))
     asset = Asset(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in ARRAYS}, clip=clip)
-    check(asset, paths[0].parent)
+    check(asset, files[0].parent)
     return LoadedAsset(asset, ups.pop(), next(filter(None, notes), ""))
 
 

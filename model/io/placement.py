@@ -21,7 +21,8 @@ def place_asset(asset: Asset, matrix: np.ndarray) -> Asset:
     if size < 1e-9:
         raise InputError("The object is scaled to nothing; give it a scale.")
     A = matrix[:3, :3] / size
-    clip = replace(asset.clip, scale=float(size), translation=tuple(map(float, matrix[:3, 3])))
+    x, y, z = map(float, matrix[:3, 3])
+    clip = replace(asset.clip, scale=float(size), translation=(x, y, z))
     if np.abs(A - np.eye(3)).max() < 1e-6:
         return replace(asset, clip=clip)
     if np.abs(A @ A.T - np.eye(3)).max() < 1e-5 and np.linalg.det(A) > 0:

@@ -114,8 +114,8 @@ def _read_compressed(path: Path) -> Asset:
             shifts, masks = 32 - np.cumsum(widths), [(1 << width) - 1 for width in widths]
             return [((rows[name] >> np.uint32(s)) & np.uint32(m)) / m for s, m in zip(shifts, masks, strict=True)]
 
-        *rgb, opacity = unpacked("packed_color", 8, 8, 8, 8)
-        rgb = np.stack(rgb, 1)
+        *colours, opacity = unpacked("packed_color", 8, 8, 8, 8)
+        rgb = np.stack(colours, 1)
         if "min_r" in chunk.dtype.names:
             rgb = between(("r", "g", "b"), rgb)
         largest, *others = unpacked("packed_rotation", 2, 10, 10, 10)

@@ -195,7 +195,8 @@ def _in_the_world(asset: Asset, path: Path, stage, prim) -> tuple[Asset, np.ndar
         matrix, motion = rest_and_motion(np.stack(matrices))
         scale = float(matrix[0, 0])
         if scale > 0 and np.abs(matrix[:3, :3] - scale * np.eye(3)).max() < 1e-6 * scale:
-            clip = replace(asset.clip, scale=scale, translation=tuple(map(float, matrix[:3, 3])))
+            x, y, z = map(float, matrix[:3, 3])
+            clip = replace(asset.clip, scale=scale, translation=(x, y, z))
             return replace(asset, clip=clip), motion
         return place_asset(asset, matrix), motion
     except InputError:
