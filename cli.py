@@ -13,6 +13,7 @@ from pathlib import Path
 
 from . import __version__
 from .datagen.sequence import InputError
+from .exit_codes import NOBODY_READS, exit_code
 
 EPILOG = """the road, step by step:
   timesplat render fox.glb --out data/fox --rig alternating     24 posed images with depth and motion
@@ -21,9 +22,6 @@ EPILOG = """the road, step by step:
 all of it at once, with pictures and figures:
   timesplat demo fox.glb
 """
-
-
-PIPE_CLOSED = 141  # what a shell says of a program that SIGPIPE ended
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -40,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
                 stream.flush()
             except BrokenPipeError:  # what is left goes nowhere, so that the interpreter's own flush has no complaint
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-        return PIPE_CLOSED
+        return NOBODY_READS
 
 
 def _main(argv: list[str] | None) -> int:
@@ -64,21 +62,7 @@ def _main(argv: list[str] | None) -> int:
             stream.reconfigure(errors="backslashreplace")
     args = parser.parse_args(argv)
     args.command = shlex.join(["timesplat", *map(str, argv)])  # for tables, which say by which command they were made
-    try:
-        return args.run(args) or 0
-    except InputError as e:
-        print(f"timesplat: {e}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("timesplat: stopped; what was complete is kept, and the same command goes on.", file=sys.stderr)
-        return 130
-    except ModuleNotFoundError as e:
-        extra = {"bpy": "render", "OpenEXR": "render", "torch": "torch", "numba": "torch", "pxr": "usd"}
-        name = (e.name or "").split(".")[0]
-        if name not in extra:
-            raise
-        print(f"timesplat: {name} is not installed; pip install 'timesplat[{extra[name]}]'.", file=sys.stderr)
-        return 2
+    return exit_code("timesplat", lambda: args.run(args))
 
 
 # ---------------------------------------------------------------- render

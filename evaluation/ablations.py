@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from ..exit_codes import exit_code
 from . import protocol, runner
 from .cache import Cache, name_sequences
 from .figures import command_line, write_table, write_whole
@@ -106,14 +107,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--objects", type=int, help="score on so many held-out objects (default: all)")
     p.add_argument("--table", action="store_true", help="write the table of what is finished, train nothing")
     options = AblationOptions(**vars(p.parse_args(argv)))
-    try:
-        return run(options, command_line("timesplat.evaluation.ablations", argv))
-    except InputError as e:
-        print(f"ablations: {e}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("ablations: stopped; the same command goes on.", file=sys.stderr)
-        return 130
+    return exit_code("ablations", lambda: run(options, command_line("timesplat.evaluation.ablations", argv)))
 
 
 def run(options: AblationOptions, command: str) -> int:

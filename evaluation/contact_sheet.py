@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datagen.sequence import InputError, Sequence, read_sequence
+from ..datagen.sequence import Sequence, read_sequence
+from ..exit_codes import exit_code
 from ..model.views import load_views
 from .figures import write_whole
 from .pictures import grid
@@ -76,15 +77,15 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("out", type=Path, help=".png to write")
     p.add_argument("--frames", type=int, default=8, help="columns (default: 8)")
     args = p.parse_args(argv)
-    try:
-        data = io.BytesIO()
-        contact_sheet(read_sequence(args.sequence), args.frames).save(data, "PNG", optimize=True)
-        write_whole(args.out, data.getvalue())
-    except InputError as e:
-        print(f"timesplat: {e}", file=sys.stderr)
-        return 2
-    print(args.out)
-    return 0
+    return exit_code("contact_sheet", lambda: write_contact_sheet(args.sequence, args.out, args.frames))
+
+
+def write_contact_sheet(folder: Path, out: Path, frames: int) -> None:
+    """The contact sheet of the Sequence in a folder as a .png, whole or not at all. Raises InputError."""
+    data = io.BytesIO()
+    contact_sheet(read_sequence(folder), frames).save(data, "PNG", optimize=True)
+    write_whole(out, data.getvalue())
+    print(out)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Methods against one another, object by object: `python evaluation/differences.py out/tables/rows.jsonl guided
-guided+refine:10 guided+budget:10%` says, of the rows that `timesplat evaluate` wrote, how much each of the later
+"""Methods against one another, object by object: `python -m timesplat.evaluation.differences out/tables/rows.jsonl
+guided guided+refine:10 guided+budget:10%` says, of the rows that `timesplat evaluate` wrote, how much each of the later
 methods is above the first one on novel views (PSNR in dB: mean, standard error, the worst object), and with how many
 of its Gaussians and seconds."""
 
@@ -14,9 +14,14 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
+from ..datagen.sequence import InputError
+from ..exit_codes import exit_code
+
 
 def read(path: Path) -> dict[tuple, dict[str, dict]]:
-    """{(size, setup, method): {object: row}}"""
+    """{(size, setup, method): {object: row}}. Raises InputError where there is no such file."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; `timesplat evaluate --out DIR` writes DIR/rows.jsonl.")
     found: dict[tuple, dict[str, dict]] = defaultdict(dict)
     for line in path.read_text().splitlines():
         if line.strip():
@@ -51,17 +56,13 @@ def compare(rows: dict, first: str, others: list[str]) -> list[str]:
     return lines
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", type=Path, help="rows.jsonl of `timesplat evaluate`")
     parser.add_argument("first", help="the method that the others are held against")
     parser.add_argument("others", nargs="+")
-    args = parser.parse_args()
-    if not args.rows.is_file():
-        print(f"{args.rows}: no such file; `timesplat evaluate --out DIR` writes DIR/rows.jsonl.", file=sys.stderr)
-        return 2
-    print("\n".join(compare(read(args.rows), args.first, args.others)))
-    return 0
+    args = parser.parse_args(argv)
+    return exit_code("differences", lambda: print("\n".join(compare(read(args.rows), args.first, args.others))))
 
 
 if __name__ == "__main__":

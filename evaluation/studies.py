@@ -28,6 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from ..exit_codes import exit_code
 from . import paper, protocol
 from .ablations import RUNS, read_log
 from .cache import Cache, name_sequences
@@ -76,32 +77,23 @@ def main(argv: list[str] | None = None) -> int:
             sub.add_argument("--device", default="cpu", help="where methods run: cpu or cuda (default: cpu)")
         for words, how in arguments:
             sub.add_argument(words, **how)
-    args = p.parse_args(argv)
+    return exit_code("studies", lambda: study(p.parse_args(argv), argv))
+
+
+def study(args: argparse.Namespace, argv: list[str] | None) -> None:
+    """The study that was asked for, with its part of the options."""
     run, default = args.run, STUDIES[args.study][2]
-    try:
-        methods = parse_specs(args.methods, seconds=10.0) if default else []
-        options = StudyOptions(
-            out=args.out,
-            made_by=Provenance.of(command_line("timesplat.evaluation.studies", argv), [m.weights for m in methods]),
-            subjects=subjects(args.folders, args.size) if default else {},
-            methods=methods,
-        )
-        for f in fields(options):  # each study has its own arguments
-            if f.name not in ("made_by", "subjects", "methods") and hasattr(args, f.name):
-                setattr(options, f.name, getattr(args, f.name))
-        run(options)
-    except InputError as e:
-        print(f"studies: {e}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("studies: stopped; what is scored is kept, and the same command goes on.", file=sys.stderr)
-        return 130
-    except ModuleNotFoundError as e:
-        if e.name != "matplotlib":
-            raise
-        print("studies: matplotlib is not installed; pip install 'timesplat[figures]'.", file=sys.stderr)
-        return 2
-    return 0
+    methods = parse_specs(args.methods, seconds=10.0) if default else []
+    options = StudyOptions(
+        out=args.out,
+        made_by=Provenance.of(command_line("timesplat.evaluation.studies", argv), [m.weights for m in methods]),
+        subjects=subjects(args.folders, args.size) if default else {},
+        methods=methods,
+    )
+    for f in fields(options):  # each study has its own arguments
+        if f.name not in ("made_by", "subjects", "methods") and hasattr(args, f.name):
+            setattr(options, f.name, getattr(args, f.name))
+    run(options)
 
 
 def numbers(text: str) -> list[int]:

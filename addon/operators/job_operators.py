@@ -95,11 +95,11 @@ def show_text(context, text) -> None:
 
 CLASSES = (TIMESPLAT_OT_cancel, TIMESPLAT_OT_bring, TIMESPLAT_OT_log)
 _keymap_items: list = []
+register_classes, unregister_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
+    register_classes()
     if keys := bpy.context.window_manager.keyconfigs.addon:  # none in background
         keymap = keys.keymaps.new(name="3D View", space_type="VIEW_3D")
         _keymap_items.append((keymap, keymap.keymap_items.new("timesplat.cancel", "ESC", "PRESS")))
@@ -109,5 +109,4 @@ def unregister() -> None:
     for keymap, item in _keymap_items:
         keymap.keymap_items.remove(item)
     _keymap_items.clear()
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+    unregister_classes()

@@ -179,16 +179,15 @@ def wrapped_label(layout, text: str, icon: str) -> None:
 
 
 CLASSES = (TIMESPLAT_OT_install_runtime, TIMESPLAT_OT_uninstall_runtime, TIMESPLAT_OT_self_test)
+register_classes, unregister_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
+    register_classes()
 
 
 def unregister() -> None:
     global last_job
     last_job = None
     self_test_report.clear()
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+    unregister_classes()

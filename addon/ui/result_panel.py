@@ -82,15 +82,14 @@ def _menu(self, context):
 
 
 CLASSES = (TIMESPLAT_PT_result, TIMESPLAT_PT_result_properties, TIMESPLAT_MT_result)
+register_classes, unregister_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    for cls in CLASSES:
-        bpy.utils.register_class(cls)
+    register_classes()
     bpy.types.VIEW3D_MT_object.append(_menu)
 
 
 def unregister() -> None:
     bpy.types.VIEW3D_MT_object.remove(_menu)
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+    unregister_classes()
