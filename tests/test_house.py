@@ -49,6 +49,7 @@ LAYERS = {
             "evaluation.ablations",
             "evaluation.differences",
         ),
+        ("evaluation.study_scores",),
         ("evaluation.studies", "evaluation.contact_sheet"),
     ),
     "addon": (

@@ -144,7 +144,8 @@ def _blend(P, pairs, first, last, x0, y0, w, h, state, live):
 def _unblend(P, pairs, slots, first, last, x0, y0, w, h, state, deep, sums):
     """Backward through one tile: state has planes T, B (the colour behind, dotted with the gradient, over its
     own transmittance), dL/dr, dL/dg, dL/db, index; deep: the highest index per cell. Writes the pairs' rows of
-    sums, those of hidden pairs excepted."""
+    sums, those of hidden pairs excepted. What stands before
+    the sums is `_blend`'s, written out again: a function of both would hand back fourteen vectors to each step."""
     zero, one, lowest, highest = splat(float32(0)), splat(float32(1)), splat(LOG_ALPHA_MIN), splat(HIGHEST)
     flat = sums.reshape(-1)
     for i in range(last - 1, first - 1, -1):
