@@ -12,7 +12,7 @@ from timesplat.datagen.rigs import RIGS
 from timesplat.datagen.sequence import read_sequence
 from timesplat.evaluation import contact_sheet
 
-PAGE = (Path(__file__).resolve().parent.parent / "docs/datasets.md").read_text()
+PAGE = (Path(__file__).resolve().parents[2] / "docs/datasets.md").read_text()
 
 
 @pytest.fixture(scope="module")
