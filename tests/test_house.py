@@ -70,6 +70,18 @@ LAYERS = {
         ("datagen.capture",),
         ("datagen.render_asset", "datagen.farm"),
     ),
+    "benchmarks": (
+        ("benchmarks.timing", "benchmarks.cameras", "benchmarks.opensplat"),
+        (
+            "benchmarks.blender_display",
+            "benchmarks.network",
+            "benchmarks.rasterizer",
+            "benchmarks.renderer",
+            "benchmarks.training",
+            "benchmarks.usd",
+        ),
+        ("benchmarks.rasterizer_cuda",),
+    ),
 }
 # What the product, all of `model` but these, does not know; they may use every layer up to the one named.
 ASIDE = {"model.baselines": "model.methods", "model.training": "model.inference"}
