@@ -352,7 +352,7 @@ def frontiers(centre: list[Mean]) -> str:
     lines = ["| frontier | among ways that see | on it, cheapest first | baselines on it |", "|---|---|---|---|"]
     pairs = [(k, "seconds") for k in charted(centre)] + [("psnr", "gaussians"), ("psnr", "usd_mb")]
     for worth, cost in pairs:
-        if not any(m[cost] for m in centre):
+        if not any(m.mean[cost] for m in centre):
             continue
         for sees in (True, False, None):
             group = [m for m in centre if sees is None or m.method.has_depth == sees]

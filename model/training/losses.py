@@ -103,9 +103,9 @@ def pixel_truth(network: Network, inputs: Views, geometry: Geometry | None) -> P
     if geometry is not None:
         owner = geometry.pixel_index
     else:
-        row = network.rows(inputs, network.kept_patches(inputs))
-        kept = (row >= 0).nonzero()[:, 0]
-        owner = kept[torch.argsort(row[kept])]
+        place = network.pixel_places(inputs, network.kept_patches(inputs))
+        kept = (place >= 0).nonzero()[:, 0]
+        owner = kept[torch.argsort(place[kept])]
     view_time = inputs.time[:, None, None].expand_as(inputs.alpha).flatten()
     away = (lifted.gaussians.t - view_time[lifted.pixel_index]).abs()
     order = torch.argsort(away, descending=True, stable=True)

@@ -64,15 +64,20 @@ def dancer(tmp_path_factory):
     from mathutils import Vector
     from mathutils.bvhtree import BVHTree
 
-    from timesplat.datagen import capture, rigs, scene, zoo
+    from timesplat.datagen import rigs
+    from timesplat.datagen.capture import Subject, capture
+    from timesplat.datagen.render_setup import CaptureSettings
+    from timesplat.datagen.scene.measure import normalisation
+    from timesplat.datagen.scene.open import empty_session
+    from timesplat.datagen.zoo.build import build_object
 
-    scene.empty()
-    zoo.build(900002)
+    empty_session()
+    build_object(900002)
     frames = list(range(1, 25))
-    norm, _ = scene.normalisation(frames)
+    norm, _ = normalisation(frames)
     out = tmp_path_factory.mktemp("dancer") / "zoo"
     shots = rigs.alternating(list(range(24)))
-    seq = capture.capture(shots, out, frames=frames, normalisation=norm, size=64, samples=4)
+    seq = capture(shots, out, Subject(frames, norm), CaptureSettings(size=64, samples=4))
     mesh = bpy.data.meshes["zoo_900002"]
     mesh.calc_loop_triangles()
     triangles = np.array([t.vertices for t in mesh.loop_triangles])
@@ -92,7 +97,7 @@ def dancer(tmp_path_factory):
         weights = np.concatenate([1 - weights.sum(1, keepdims=True), weights], 1)
         return np.einsum("nc,fncx->fnx", weights, posed[:, corners])
 
-    return load_views(seq, range(24), passes=True), track
+    return load_views(seq, range(24), has_depth=True), track
 
 
 def test_velocities_and_later_places_are_those_of_the_mesh(dancer):
