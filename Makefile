@@ -25,7 +25,10 @@ setup: $(VENV)/.ready ## the environment alone
 demo: $(VENV)/.ready ## render, reconstruct and export a procedural animated object into out/demo
 	$(BIN)/timesplat demo --out out/demo
 
-test: lint types ## lint, types and all tests
+test: lint ## lint, types and all tests; types beside the tests, most of which use one core
+	@$(MAKE) --no-print-directory -j2 types unit
+
+unit: $(VENV)/.ready
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.ready ## ruff alone
@@ -54,4 +57,4 @@ zip: $(VENV)/.ready ## the Blender extension, into dist/
 clean:           ## what can be made again
 	rm -rf $(VENV) .venv-bpy* out dist build *.egg-info
 
-.PHONY: help setup demo test lint types test-blender test-blenders zip clean
+.PHONY: help setup demo test lint types unit test-blender test-blenders zip clean
