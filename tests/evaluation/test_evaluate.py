@@ -40,18 +40,8 @@ def test_bad_options_are_refused_before_anything_runs(folders, tmp_path, capsys)
 
 
 def test_the_command_scores_finished_sequences(alternating_folders, tmp_path, capsys):
-    words = [
-        "evaluate",
-        str(alternating_folders),
-        "--setup",
-        "alternating",
-        "--size",
-        "16",
-        "--methods",
-        "white",
-        "--jobs",
-        "1",
-    ]
+    words = ["evaluate", str(alternating_folders), "--setup", "alternating", "--size", "16"]
+    words += ["--methods", "white", "--jobs", "1"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert list(metrics["objects"]) == ["a", "b"] and metrics["methods"]["white"]["psnr"] > 0

@@ -9,19 +9,11 @@ from safetensors.torch import load_file, save_file
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model import baselines  # noqa: F401, adds its methods
-from timesplat.model.checkpoints_io import CHECKPOINTS, load_network, save_network
+from timesplat.model.checkpoints_io import CHECKPOINTS, load_network
 from timesplat.model.methods import METHODS
 from timesplat.model.network import Config, Network
 
 TINY = Config(width=32, depth=1, heads=2, source="given")
-
-
-@pytest.fixture
-def checkpoint(tmp_path):
-    torch.manual_seed(0)
-    path = tmp_path / "tiny.safetensors"
-    save_network(path, Network(TINY), {"steps": "0"})
-    return path
 
 
 def test_checkpoint_round_trip(checkpoint):

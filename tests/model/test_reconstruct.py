@@ -8,20 +8,11 @@ import torch
 
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.model import baselines  # noqa: F401, adds its methods
-from timesplat.model.checkpoints_io import save_network
 from timesplat.model.methods import ReconstructOptions
-from timesplat.model.network import Config, Network
+from timesplat.model.network import Config
 from timesplat.model.reconstruct import reconstruct
 
 TINY = Config(width=32, depth=1, heads=2, source="given")
-
-
-@pytest.fixture
-def checkpoint(tmp_path):
-    torch.manual_seed(0)
-    path = tmp_path / "tiny.safetensors"
-    save_network(path, Network(TINY), {"steps": "0"})
-    return path
 
 
 @pytest.mark.parametrize("method", ["white", "hull", "lift"])
