@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from .image_files import write_exr
+from .track_file import SurfaceTracks, read_tracks
 
 FORMAT = "timesplat-sequence-1"
 
@@ -86,6 +87,8 @@ class Sequence:
     aabb: list = field(default_factory=lambda: [[-1, -1, -1], [1, 1, 1]])  # over all frames, normalised
     provenance: dict = field(default_factory=dict)  # asset, sha256, licence, tool versions, seed, …
     views: list[View] = field(default_factory=list)
+    tracks: str | None = None  # path below the folder: surface points followed through the clip, see `track_file`
+    untracked: list[str] = field(default_factory=list)  # what is seen and has none, by the objects' names
     root: Path | None = None  # the folder it was read from
 
     def unit_time(self, frame: float) -> float:
@@ -152,6 +155,17 @@ class Sequence:
                 "that needs none (rgb)."
             )
         return read_passes(self.folder / view.passes, (self.height, self.width))
+
+    def load_tracks(self) -> SurfaceTracks:
+        """The surface points followed through the clip. Raises InputError where there are none or the file is
+        damaged."""
+        if self.tracks is None:
+            raise InputError(f"{self.root}: it holds no surface tracks; render it again with --tracks auto.")
+        path = self.folder / self.tracks
+        try:
+            return read_tracks(path, self.frame_end - self.frame_start + 1)
+        except (OSError, ValueError) as e:
+            raise InputError(f"{path}: the tracks cannot be read ({e}); render the Sequence again.") from None
 
 
 @dataclass
@@ -305,6 +319,8 @@ def _to_json(seq: Sequence) -> dict:
         "normalisation": asdict(seq.normalisation),
         "aabb": np.asarray(seq.aabb, float).tolist(),
         "provenance": seq.provenance,
+        **({"tracks_path": seq.tracks} if seq.tracks else {}),
+        **({"untracked": seq.untracked} if seq.untracked else {}),
         "frames": frames,
     }
 
@@ -356,6 +372,8 @@ def read_sequence(folder: Path) -> Sequence:
             normalisation=Normalisation(float(norm.get("scale", 1.0)), (float(x), float(y), float(z))),
             aabb=d.get("aabb", [[-1, -1, -1], [1, 1, 1]]),
             provenance=d.get("provenance", {}),
+            tracks=d.get("tracks_path"),
+            untracked=[str(name) for name in d.get("untracked", [])],
             root=folder,
         )
         for f in d["frames"]:
@@ -387,6 +405,8 @@ def _check(seq: Sequence, path: Path) -> None:
     if not (s.scale > 0 and np.isfinite([s.scale, *s.translation]).all()):
         raise InputError(f"{path}: the normalisation is not a finite positive scale; render it again.")
     root = path.parent.resolve()
+    if seq.tracks:
+        _check_file(path, root, seq.tracks)
     for v in seq.views:
         name = v.image or "?"
         R = v.c2w[:3, :3] if v.c2w.shape == (4, 4) else None
@@ -397,8 +417,13 @@ def _check(seq: Sequence, path: Path) -> None:
         if not (v.fx > 0 and v.fy > 0 and np.isfinite([v.fx, v.fy, v.cx, v.cy]).all()):
             raise InputError(f"{path}: the focal length of {name} is not positive; correct it.")
         for rel in filter(None, (v.image, v.passes)):
-            full = (path.parent / rel).resolve()
-            if not full.is_relative_to(root):
-                raise InputError(f"{path}: {rel} points outside of the Sequence's folder; correct it.")
-            if not full.is_file():
-                raise InputError(f"{full}: the file is missing; render the Sequence again.")
+            _check_file(path, root, rel)
+
+
+def _check_file(path: Path, root: Path, relative: str) -> None:
+    """Raises InputError unless the file is there, and below the Sequence's folder `root`."""
+    full = (path.parent / relative).resolve()
+    if not full.is_relative_to(root):
+        raise InputError(f"{path}: {relative} points outside of the Sequence's folder; correct it.")
+    if not full.is_file():
+        raise InputError(f"{full}: the file is missing; render the Sequence again.")

@@ -63,7 +63,7 @@ LAYERS = {
         ("addon",),
     ),
     "datagen": (
-        ("datagen.image_files", "datagen.rigs"),
+        ("datagen.image_files", "datagen.rigs", "datagen.track_file"),
         ("datagen.sequence",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.render_setup",),

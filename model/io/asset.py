@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...datagen.sequence import InputError, Sequence
+from .paths import Paths, inverse, multiply, rotate
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C0 * f_dc
 VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment (the paper's filter)
@@ -45,7 +46,11 @@ class Clip:
 
 @dataclass
 class Asset:
-    """N 4D Gaussians in kinematic form (see model/gaussians.py), all arrays float32, linear values."""
+    """N 4D Gaussians in kinematic form (see model/gaussians.py), all arrays float32, linear values.
+
+    Where there are `paths`, each rides on one of them: place and rotation at any other time follow from those at its
+    own time `t` by the path's, its velocity is that of then, and it is there as long as its path says, with a lifetime
+    that knows no end (STATIC_SIGMA_T)."""
 
     xyz: np.ndarray  # (N,3) position at its own time, normalised space
     t: np.ndarray  # (N,) its own time, clip = [-1,1]
@@ -56,17 +61,42 @@ class Asset:
     rgb: np.ndarray  # (N,3) sRGB-encoded, 0..1
     opacity: np.ndarray  # (N,) 0..1
     clip: Clip = field(default_factory=Clip)
+    path: np.ndarray | None = None  # (N,) int32, the row of `paths` that each rides on
+    paths: Paths | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
 
+    def __getitem__(self, rows: np.ndarray) -> Asset:
+        """The Gaussians of these indices or this mask; paths that nothing rides on any more are left out."""
+        arrays = {name: getattr(self, name)[rows] for name in ARRAYS}
+        if self.paths is None:
+            return replace(self, **arrays)
+        used, path = np.unique(self.path[rows], return_inverse=True)
+        return replace(self, **arrays, path=path.astype(np.int32).reshape(-1), paths=self.paths[used])
+
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N,3) in normalised space and opacities (N,) 0..1 at a model time (-1..1 over the clip,
-        any fraction; times outside continue the lines)."""
+        any fraction; times outside continue the lines, and paths stay at their ends)."""
         dt = np.float32(time) - self.t
         with np.errstate(under="ignore", over="ignore"):
             opacity = self.opacity * np.exp(-0.5 * (dt / self.sigma_t) ** 2)
-            return self.xyz + self.velocity * dt[:, None], opacity
+            if self.paths is None:
+                return self.xyz + self.velocity * dt[:, None], opacity
+        place, turn = self.paths.at(time, self.path)
+        offset, _ = self.on_path()
+        return place + rotate(turn, offset), opacity * self.paths.there(time)[self.path]
+
+    def rotation_at(self, time: float) -> np.ndarray:
+        """(N,4) the rotations at a model time: without paths they do not change."""
+        if self.paths is None:
+            return self.rotation
+        return multiply(self.paths.at(time, self.path)[1], self.on_path()[1])
+
+    def on_path(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where there are paths: offsets (N,3) and rotations (N,4) in the moving frames, which do not change."""
+        place, turn = self.paths.at(self.t, self.path)
+        return rotate(inverse(turn), self.xyz - place), multiply(inverse(turn), self.rotation)
 
     def frame_to_time(self, frame):
         """Model time of a (fractional) frame number of the clip: frame_start is -1, frame_end is +1."""
@@ -83,7 +113,7 @@ class Asset:
         return replace(self, scale=self.soft_scale(), clip=replace(self.clip, pixel=0.0))
 
 
-ARRAYS = tuple(f.name for f in fields(Asset) if f.name != "clip")
+ARRAYS = tuple(f.name for f in fields(Asset) if f.name not in ("clip", "path", "paths"))
 _WIDTHS = {"xyz": 3, "velocity": 3, "scale": 3, "rotation": 4, "rgb": 3}
 
 
@@ -138,6 +168,8 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
         raise bad("opacity leaves the range 0..1")
     if np.abs(np.linalg.norm(asset.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
         raise bad("rotation holds quaternions that are not of unit length")
+    if asset.paths is not None:
+        _check_paths(asset, bad)
     c = asset.clip
     with np.errstate(over="ignore"):  # in single precision, as Blender has them
         numbers = np.array([c.fps, c.scale, c.pixel, *c.translation], np.float32)
@@ -147,6 +179,22 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
         raise bad("the clip's frame range is empty or its translation is not three numbers")
     if c.frame_end - c.frame_start >= MAX_CLIP_FRAMES or max(abs(c.frame_start), abs(c.frame_end)) > MAX_FRAME_NUMBER:
         raise bad(f"the clip's frames run from {c.frame_start} to {c.frame_end}, which is too many or too far")
+
+
+def _check_paths(asset: Asset, bad) -> None:
+    p, n = asset.paths, len(asset)
+    knots = int(p.count.sum()) if p.count.dtype == np.int32 and p.count.ndim == 1 else -1
+    shapes = {"start": (len(p),), "end": (len(p),), "place": (knots, 3), "rotation": (knots, 4)}
+    for name, shape in shapes.items():
+        a = getattr(p, name)
+        if a.dtype != np.float32 or a.shape != shape or not np.isfinite(a).all():
+            raise bad(f"its paths' {name} is not a float32 array of shape {shape} without NaN and infinity")
+    if not ((p.count >= 1).all() and (p.start < p.end).all()):
+        raise bad("it has paths without knots, or that end before they start")
+    if np.abs(np.linalg.norm(p.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
+        raise bad("its paths hold quaternions that are not of unit length")
+    if asset.path is None or asset.path.shape != (n,) or asset.path.min() < 0 or asset.path.max() >= len(p):
+        raise bad("it has Gaussians on paths that are not there")
 
 
 def pixel_size(sequence: Sequence) -> float:

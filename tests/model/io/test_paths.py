@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Paths: interpolation against the definition by hand, windows, and what rides on them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from timesplat.datagen.sequence import InputError
+from timesplat.model.io.asset import STATIC_SIGMA_T, Asset, check, rotation_matrices
+from timesplat.model.io.paths import Paths, inverse, multiply, rotate
+
+RNG = np.random.default_rng(0)
+
+
+def quaternions(n):
+    q = RNG.normal(size=(n, 4))
+    return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+
+
+def three() -> Paths:
+    """One that stands still, a straight one for half of the clip, and one of four knots."""
+    q = quaternions(7)
+    for i in range(1, 7):
+        q[i] *= 1 if q[i] @ q[i - 1] >= 0 else -1
+    return Paths(
+        np.array([-1, -0.5, -1], np.float32),
+        np.array([1, 0.5, 1], np.float32),
+        np.array([1, 2, 4], np.int32),
+        RNG.normal(size=(7, 3)).astype(np.float32),
+        q,
+    )
+
+
+def riding(paths: Paths, n=6) -> Asset:
+    path = np.arange(n, dtype=np.int32) % 3
+    xyz, t = RNG.normal(size=(n, 3)).astype(np.float32), np.linspace(-0.5, 0.5, n).astype(np.float32)
+    one = np.ones(n, np.float32)
+    zero, grey = np.zeros((n, 3), np.float32), np.full((n, 3), 0.5, np.float32)
+    return Asset(xyz, t, zero, STATIC_SIGMA_T * one, 0.1 * grey, quaternions(n), grey, 0.5 * one, path=path, paths=paths)
+
+
+def test_between_knots_by_hand():
+    p = three()
+    place, turn = p.at(-1 / 3 + 0.25 * 2 / 3)  # a quarter of the way from the second knot of four to the third
+    assert np.allclose(place[0], p.place[0]) and np.allclose(turn[0], p.rotation[0])
+    assert np.allclose(place[2], 0.75 * p.place[4] + 0.25 * p.place[5], atol=1e-6)
+    mixed = 0.75 * p.rotation[4] + 0.25 * p.rotation[5]
+    assert np.allclose(turn[2], mixed / np.linalg.norm(mixed), atol=1e-6)
+    for time, row in ((-2.0, 1), (-0.5, 1), (0.5, 2), (2.0, 2)):
+        assert np.allclose(p.at(time)[0][1], p.place[row]), time
+
+
+def test_each_at_its_own_time():
+    p, rows, times = three(), np.array([2, 0, 2, 1]), np.array([-0.9, 0.3, 0.7, 0.1], np.float32)
+    place, turn = p.at(times, rows)
+    for i, (row, time) in enumerate(zip(rows, times, strict=True)):
+        assert np.allclose(place[i], p.at(time)[0][row]) and np.allclose(turn[i], p.at(time)[1][row])
+
+
+def test_windows():
+    p = three()
+    assert p.there(-0.5).all() and p.there(0.5).all() and list(p.there(0.51)) == [True, False, True]
+
+
+def test_rows():
+    p = three()
+    q = p[np.array([2, 1])]
+    assert list(q.count) == [4, 2] and np.array_equal(q.place, p.place[[3, 4, 5, 6, 1, 2]])
+    for time in (-1, 0.2, 0.9):
+        assert np.array_equal(q.at(time)[0], p.at(time)[0][[2, 1]])
+    assert np.array_equal(p[np.array([False, True, True])].place, p.place[1:])
+
+
+def test_what_rides_keeps_its_place_in_the_moving_frame():
+    a = riding(three())
+    check(a)
+    for i in range(len(a)):  # at its own time it is where it says
+        xyz, _ = a.at(float(a.t[i]))
+        assert np.allclose(xyz[i], a.xyz[i], atol=1e-6)
+        assert abs(a.rotation_at(float(a.t[i]))[i] @ a.rotation[i]) == pytest.approx(1, abs=1e-6)
+    offset, local = a.on_path()
+    for time in (-1.0, -0.1, 0.77):
+        place, turn = (x[a.path] for x in a.paths.at(time))
+        R = rotation_matrices(turn)
+        assert np.allclose(a.at(time)[0], place + (R @ offset[..., None])[..., 0], atol=1e-5)
+        assert np.allclose(rotation_matrices(a.rotation_at(time)), R @ rotation_matrices(local), atol=1e-5)
+    assert list(a.at(0.9)[1]) == [0.5, 0, 0.5, 0.5, 0, 0.5]
+
+
+def test_rows_of_an_asset_take_their_paths_along():
+    a = riding(three())
+    b = a[np.array([2, 5, 0])]
+    assert len(b.paths) == 2 and list(b.path) == [1, 1, 0]
+    assert np.allclose(b.at(0.3)[0], a.at(0.3)[0][[2, 5, 0]], atol=1e-6)
+    check(b)
+
+
+def test_wrong_paths_are_refused():
+    a = riding(three())
+    for wrong, said in (
+        ({"path": a.path + 1}, "not there"),
+        ({"path": None}, "not there"),
+        ({"paths": replace(a.paths, place=a.paths.place[:-1])}, "place"),
+        ({"paths": replace(a.paths, rotation=2 * a.paths.rotation)}, "unit length"),
+        ({"paths": replace(a.paths, end=a.paths.start)}, "end before"),
+        ({"paths": replace(a.paths, count=a.paths.count.astype(float))}, "place|start"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check(replace(a, **wrong))
+
+
+def test_quaternions_against_matrices():
+    a, b, v = quaternions(9), quaternions(9), RNG.normal(size=(9, 3))
+    A, B = rotation_matrices(a), rotation_matrices(b)
+    assert np.allclose(rotation_matrices(multiply(a, b)), A @ B, atol=1e-5)
+    assert np.allclose(rotate(a, v), (A @ v[..., None])[..., 0], atol=1e-5)
+    assert np.allclose(rotate(inverse(a), rotate(a, v)), v, atol=1e-5)
