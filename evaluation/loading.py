@@ -66,13 +66,13 @@ def _fraction(seq: Sequence, size: int | None) -> int:
 
 def without_depth(views: Views) -> Views:
     """The views as photographs: RGB and alpha alone."""
-    return replace(views, depth=None, flow=None)
+    return replace(views, depth=None, flow=None, surface=None)
 
 
 def collapsed(views: Views) -> Views:
     """One moment: all times 0, nothing moves."""
     flow = None if views.flow is None else torch.zeros_like(views.flow)
-    return replace(views, time=torch.zeros_like(views.time), flow=flow, frame_step=2.0)
+    return replace(views, time=torch.zeros_like(views.time), flow=flow, surface=None, frame_step=2.0)
 
 
 def thinned(views: Views, step: int) -> Views:

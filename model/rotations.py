@@ -56,6 +56,18 @@ def quaternion_multiply(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
+def conjugate(q: Tensor) -> Tensor:
+    """The inverse of unit quaternions (…,4)."""
+    return q * q.new_tensor([1.0, -1, -1, -1])
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """q (…,4) unit quaternions, v (…,3) -> (…,3) v turned by them."""
+    u = q[..., 1:]
+    side = 2 * torch.linalg.cross(u, v)
+    return v + q[..., :1] * side + torch.linalg.cross(u, side)
+
+
 def isoclinic_rotation(q_l: Tensor, q_r: Tensor) -> Tensor:
     """q_l, q_r (…,4) unit quaternions -> (…,4,4) rotations L(q_l) R(q_r) of x y z t, exactly as the paper prints
     them (appendix A.1). Its R(q_r) is the transpose of the matrix in the 4DGS code."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..datagen.sequence import Sequence
+from ..datagen.track_file import SurfaceTracks
 
 BACKGROUND = 1.0  # white: what pictures are laid on where nothing else is said
 
@@ -26,6 +27,7 @@ class Views:
     frame_step: float  # model time between two frames of the clip, 2 / (frames - 1)
     depth: Tensor | None = None  # (V,H,W) planar z, inf where there is no surface
     flow: Tensor | None = None  # (V,H,W,4) pixels to the next frame (x, y) and to the previous one (x, y)
+    surface: SurfaceTracks | None = None  # points of the surface, followed by the renderer through the whole clip
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -50,8 +52,8 @@ class Views:
 
 
 def load_views(seq: Sequence, indices, has_depth: bool = False) -> Views:
-    """The views of a Sequence at `indices`, has_depth: with depth and flow. Raises InputError for a missing or damaged
-    image or pass."""
+    """The views of a Sequence at `indices`, has_depth: with depth and flow, and the surface's tracks where it has them.
+    Raises InputError for a missing or damaged image, pass or file of tracks."""
     rgba = torch.from_numpy(np.stack([seq.load_image(i) for i in indices])).float() / 255
     c2w, intrinsics = seq.cameras(indices)
     views = Views(
@@ -66,6 +68,7 @@ def load_views(seq: Sequence, indices, has_depth: bool = False) -> Views:
         p = [seq.load_passes(i) for i in indices]
         views.depth = torch.from_numpy(np.stack([x.depth for x in p]))
         views.flow = torch.from_numpy(np.stack([np.concatenate([x.flow_next, x.flow_prev], -1) for x in p]))
+        views.surface = seq.load_tracks() if seq.tracks else None
     return views
 
 

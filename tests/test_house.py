@@ -23,7 +23,7 @@ LAYERS = {
     "model": (
         ("model.io",),
         ("model.parallel", "model.rotations", "model.devices", "model.layout"),
-        ("model.gaussians", "model.views", "model.clip"),
+        ("model.gaussians", "model.tracks", "model.views", "model.clip"),
         ("model.rasterize",),
         ("model.geometry",),
         ("model.patches", "model.heads", "model.hexplane", "model.network"),
@@ -141,7 +141,7 @@ def test_wings(name):
     if wing == "datagen":
         assert all(within(r, "datagen") for r in told)
     if wing == "model":
-        assert {r for r in told if not within(r, "model")} <= {"datagen.sequence", "datagen.rigs"}
+        assert {r for r in told if not within(r, "model")} <= {"datagen.sequence", "datagen.rigs", "datagen.track_file"}
     if wing == "addon":
         others = {r for r in told if not within(r, "addon") and not within(r, "datagen")}
         assert all(within(r, "model.io") for r in others)

@@ -208,7 +208,9 @@ def shrink(views: Views, by: int) -> Views:
     alpha = blocks(views.alpha[..., None])
     total = alpha.mean(3)
     rgb = (blocks(views.rgb) * alpha).mean(3) / total.clamp_min(1e-6)
-    small = Views(rgb, total[..., 0], views.c2w, views.intrinsics / by, views.time, views.frame_step)
+    small = replace(
+        views, rgb=rgb, alpha=total[..., 0], intrinsics=views.intrinsics / by, depth=None, flow=None
+    )
     if views.depth is None or views.flow is None:
         return small
     depth, flow = blocks(views.depth[..., None]), blocks(views.flow)
