@@ -98,6 +98,16 @@ class Asset:
         place, turn = self.paths.at(self.t, self.path)
         return rotate(inverse(turn), self.xyz - place), multiply(inverse(turn), self.rotation)
 
+    def path_velocity(self) -> np.ndarray:
+        """(N,3) where there are paths: velocities at their own times, of the half frames before and after together."""
+        half = np.float32(1 / max(self.clip.frame_end - self.clip.frame_start, 1))
+        before = np.maximum(self.t - half, np.minimum(self.t, self.paths.start[self.path]))
+        after = np.minimum(self.t + half, np.maximum(self.t, self.paths.end[self.path]))
+        offset, _ = self.on_path()
+        (place, turn), (later, turned) = (self.paths.at(time, self.path) for time in (before, after))
+        way = later + rotate(turned, offset) - place - rotate(turn, offset)
+        return way / np.maximum(after - before, np.float32(1e-9))[:, None]
+
     def frame_to_time(self, frame):
         """Model time of a (fractional) frame number of the clip: frame_start is -1, frame_end is +1."""
         return self.clip.frame_to_time(frame)
