@@ -10,6 +10,8 @@ of a ripple.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from .asset import ARRAYS, STATIC_SIGMA_T, Asset
@@ -44,7 +46,7 @@ def _pieces(asset: Asset, per_frame: int) -> Asset:
     phase = np.floor(np.arange(len(asset)) * GOLDEN % 1 * PHASES) / PHASES
     kinds = np.stack([start, end, _lengths(asset, frame / per_frame), phase], 1)
     kinds, kind = np.unique(kinds, axis=0, return_inverse=True)
-    rows = [_row(*values, EDGE * frame * 2 ** values[-1]) for values in kinds.tolist()]
+    rows = [_row(s, e, long, p, EDGE * frame * 2**p) for s, e, long, p in kinds.tolist()]
     many, kind = np.array([len(r) for r in rows]), kind.reshape(-1)
     owner = np.repeat(np.arange(len(asset)), many[kind])
     place = np.arange(len(owner)) - np.repeat(np.cumsum(many[kind]) - many[kind], many[kind])  # in the owner's row
@@ -62,7 +64,8 @@ def _pieces(asset: Asset, per_frame: int) -> Asset:
         "rgb": asset.rgb[owner],
         "opacity": opacity * as_opaque,
     }
-    return Asset(**{name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}, clip=asset.clip)
+    exact: dict[str, Any] = {name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}
+    return Asset(**exact, clip=asset.clip)
 
 
 def _row(start: float, end: float, length: float, phase: float, edge: float) -> np.ndarray:
@@ -77,7 +80,8 @@ def _row(start: float, end: float, length: float, phase: float, edge: float) -> 
     if not begins:
         t = np.arange(-1 - (BEYOND - phase) * length, 1 + BEYOND * length, length)
         return np.stack([t, np.full_like(t, length)], 1)
-    sizes, size, whole = [], edge, end - start + edge
+    sizes: list[float] = []
+    size, whole = edge, end - start + edge
     if ends:
         while 2 * (sum(sizes) + size) < whole and size < length:
             sizes.append(size)
@@ -131,11 +135,12 @@ def _lines(asset: Asset, rows: np.ndarray, t: np.ndarray, length: np.ndarray) ->
 
 
 def _window(asset: Asset, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return asset.paths.start[asset.path[rows]], asset.paths.end[asset.path[rows]]
+    paths, path = asset.riding()
+    return paths.start[path[rows]], paths.end[path[rows]]
 
 
 def _poses(asset: Asset, rows: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (M,3) and rotations (M,4) of the Gaussians `rows` (M,), each at its time (M,)."""
-    offset, rotation = asset.on_path()
-    place, turn = asset.paths.at(time, asset.path[rows])
+    (paths, path), (offset, rotation) = asset.riding(), asset.on_path()
+    place, turn = paths.at(time, path[rows])
     return place + rotate(turn, offset[rows]), multiply(turn, rotation[rows])

@@ -17,10 +17,8 @@ import numpy as np
 from ...datagen.sequence import InputError
 from .paths import Paths, continuous
 
-PATH = np.dtype(
-    [("start", "<f4"), ("end", "<f4"), ("knots", "<i4"), *((name, "<f4") for name in ("x", "y", "z", "size"))]
-)
-KNOT = np.dtype([(name, "<i2") for name in ("x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3")])
+PATH = {"start": "<f4", "end": "<f4", "knots": "<i4", "x": "<f4", "y": "<f4", "z": "<f4", "size": "<f4"}
+KNOT = dict.fromkeys(("x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3"), "<i2")
 STEPS = 32767  # of a 16-bit number
 
 
@@ -28,14 +26,14 @@ def path_tables(paths: Paths) -> dict[str, np.ndarray]:
     """{"path": (P,) of PATH, "knot": (M,) of KNOT}."""
     place, first = paths.place.astype(np.float64), paths.first
     low, high = (f.reduceat(place, first) for f in (np.minimum, np.maximum))
-    rows, knots = np.empty(len(paths), PATH), np.empty(len(place), KNOT)
+    rows, knots = (np.empty(n, list(kind.items())) for n, kind in ((len(paths), PATH), (len(place), KNOT)))
     rows["start"], rows["end"], rows["knots"] = paths.start, paths.end, paths.count
     rows["x"], rows["y"], rows["z"] = ((low + high) / 2).T
     middle = np.stack([rows[a] for a in "xyz"], 1).astype(np.float64)  # as it is stored
     rows["size"] = np.maximum(high - middle, middle - low).max(1)
     size = np.repeat(np.maximum(rows["size"], np.float32(1e-30)).astype(np.float64), paths.count)
     steps = np.concatenate([(place - np.repeat(middle, paths.count, 0)) / size[:, None], paths.rotation], 1) * STEPS
-    for name, column in zip(KNOT.names, np.round(steps).clip(-STEPS, STEPS).T, strict=True):
+    for name, column in zip(KNOT, np.round(steps).clip(-STEPS, STEPS).T, strict=True):
         knots[name] = column
     return {"path": rows, "knot": knots}
 
@@ -43,15 +41,15 @@ def path_tables(paths: Paths) -> dict[str, np.ndarray]:
 def paths_from_tables(rows: np.ndarray, knots: np.ndarray, source: str | Path) -> Paths:
     """What `path_tables` made tables of, from arrays with these fields of any type. Raises InputError where the knots
     are not those of the paths; values are for `asset.check` to judge."""
-    for table, dtype, element in ((rows, PATH, "path"), (knots, KNOT, "knot")):
-        if lost := [name for name in dtype.names if name not in table.dtype.names]:
+    for table, kind, element in ((rows, PATH, "path"), (knots, KNOT, "knot")):
+        if lost := [name for name in kind if name not in table.dtype.fields]:
             raise InputError(f"{source}: its element {element} lacks {lost[0]}; export it again from Timesplat.")
-    count = rows["knots"].astype(np.float64)
-    if not ((count >= 1) & (count <= len(knots))).all() or count.sum() != len(knots):
+    told = rows["knots"].astype(np.float64)
+    if not ((told >= 1) & (told <= len(knots))).all() or told.sum() != len(knots):
         raise InputError(f"{source}: its {len(knots)} knots are not those that its paths count; export it again.")
-    count = count.astype(np.int32)
+    count = told.astype(np.int32)
     with np.errstate(over="ignore", invalid="ignore"):
-        steps = np.stack([knots[name] for name in KNOT.names], 1) / np.float64(STEPS)
+        steps = np.stack([knots[name] for name in KNOT], 1) / np.float64(STEPS)
         middle, size = (np.stack([rows[a] for a in names], 1).astype(np.float64) for names in ("xyz", ("size",)))
         place = np.repeat(middle, count, 0) + np.repeat(size, count, 0) * steps[:, :3]
         length = np.linalg.norm(steps[:, 3:], axis=1, keepdims=True)
