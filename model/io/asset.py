@@ -209,6 +209,8 @@ def _check_paths(p: Paths, path: np.ndarray | None, n: int, bad: Callable[[str],
         a = getattr(p, name)
         if a.dtype != np.float32 or a.shape != shape or not np.isfinite(a).all():
             raise bad(f"its paths' {name} is not a float32 array of shape {shape} without NaN and infinity")
+    if len(p) > MAX_GAUSSIANS:  # a .ply has their numbers as floats
+        raise bad(f"it has more than {MAX_GAUSSIANS:,} paths")
     if not ((p.count >= 1).all() and (p.start < p.end).all()):
         raise bad("it has paths without knots, or that end before they start")
     if np.abs(np.linalg.norm(p.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:

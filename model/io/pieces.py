@@ -27,7 +27,7 @@ BEYOND = 1.25  # lengths by which pieces go on beyond the clip's ends: of one fu
 EDGE = 0.1  # of a frame and up to twice that: the first piece where a path begins or ends within the clip
 PHASES, GOLDEN = 8, 0.618034  # how many different times there are at which neighbours change over, and who takes which
 MOMENTS = 1 << 20  # Gaussians times frames that are worked on at once
-PIXELS, TOLERANCE = 0.25, 1e-3  # by which a piece may miss its Gaussian; in normalised units where no pixel is known
+PIXELS, TOLERANCE = 0.125, 1e-3  # by which a piece may miss its Gaussian; in normalised units where no pixel is known
 
 
 def to_pieces(asset: Asset, per_frame: int = 1) -> Asset:

@@ -113,6 +113,12 @@ def test_wrong_paths_are_refused():
             check(replace(a, **wrong))
 
 
+def test_more_paths_than_a_file_can_number_are_refused(monkeypatch):
+    monkeypatch.setattr("timesplat.model.io.asset.MAX_GAUSSIANS", 2)
+    with pytest.raises(InputError, match="more than 2 paths"):
+        check(riding(three()))
+
+
 def test_quaternions_against_matrices():
     a, b, v = quaternions(9), quaternions(9), RNG.normal(size=(9, 3))
     A, B = rotation_matrices(a), rotation_matrices(b)

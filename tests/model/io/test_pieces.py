@@ -82,7 +82,7 @@ def likeness(asset: Asset, pieces: Asset, inference: bool) -> float:
     ("motion", "most", "least"),
     [
         ({}, 1, 99),
-        ({"turn": 2}, 10, 47),
+        ({"turn": 2}, 16, 48),
         ({"turn": 5, "bend": 0.1}, 26, 46),
         ({"turn": 15}, 26, 41),
         ({"turn": 15, "bend": 0.5}, 26, 35),  # its end goes through an eighth of the object a frame
