@@ -162,6 +162,8 @@ def export_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--half", action="store_true", help="USD: half precision")
     p.add_argument("--original", type=Path, help="USD: file of the original object, for a variant set")
     p.add_argument("--original-start", type=float, help="its frame at the clip's first frame (default: the same frame)")
+    p.add_argument("--pieces", action="store_true", help="write straight 4D Gaussians in place of tracks, for readers "
+                   "that know no paths")  # fmt: skip
     p.add_argument("--check", action="store_true", help="USD: exit with 1 if the validator complains")
     p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply or .splat")
     p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a 3DGS .ply a frame into a new folder")
@@ -184,6 +186,8 @@ def export(args: argparse.Namespace) -> int:
         raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
     if args.frame is not None and (usd or args.sequence):
         raise InputError("export: --frame is for one .ply or .splat; drop it.")
+    if args.pieces and (args.sequence or args.frame is not None):
+        raise InputError("export: --pieces is for what has time, not for moments; drop it.")
     loaded = read_asset(args.asset)
     asset, count = loaded.asset, len(loaded.asset)
     if loaded.note:
@@ -198,7 +202,7 @@ def export(args: argparse.Namespace) -> int:
     if suffix == ".blend" and args.frame is None:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             ply = Path(folder) / f"{args.asset.stem}.ply"
-            write_asset(ply, asset)
+            count = write_asset(ply, asset, pieces=args.pieces)
             save_blend(ply, args.out)
     elif suffix not in WRITABLE and args.frame is None:
         raise InputError(f"{args.out}: cannot write that; choose .usdc, .usda, .usdz, .ply or .blend.")
@@ -207,7 +211,7 @@ def export(args: argparse.Namespace) -> int:
         if usd:
             options = {"mode": args.mode, "half": args.half, "motion": loaded.motion}
             options |= {"original": args.original, "original_start": args.original_start}
-        count = write_asset(args.out, asset, frame=args.frame, **options)
+        count = write_asset(args.out, asset, frame=args.frame, pieces=args.pieces, **options)
     print(f"{args.out}: {count} Gaussians, {args.out.stat().st_size / 1e6:.1f} MB")
     complaints = check_usd(args.out) if usd else []
     for complaint in complaints:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..datagen.sequence import Sequence
+from ..datagen.sequence import InputError, Sequence
 from ..model.clip import clip_of
 from ..model.gaussians import DynamicScene, Gaussians4D, ReconstructedScene
 from ..model.geometry.coverage import coverage
@@ -96,12 +96,13 @@ def costs(
 
 
 def megabytes(scene: Gaussians4D | ReconstructedScene, seq: Sequence) -> tuple[float | None, float | None]:
-    """Of the scene as .ply and, where pxr is installed, as .usdc."""
+    """Of the scene as .ply and, where pxr is installed, as .usdc; None of what no asset can hold."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         ply, usd = Path(folder) / "a.ply", Path(folder) / "a.usdc"
-        if not isinstance(scene, Gaussians4D):
+        try:
+            asset = scene.to_asset(clip_of(seq))
+        except InputError:
             return None, None
-        asset = scene.to_asset(clip_of(seq))
         write_ply(ply, asset)
         if find_spec("pxr"):
             from ..model.io.usd_write import write_usd

@@ -38,6 +38,9 @@ class ReconstructedScene(DynamicScene, Protocol):
     def alive(self) -> Tensor:
         """(N,) bool: whether the paper's inference filters let the Gaussian through at some time of the clip."""
 
+    def to_asset(self, clip: Clip) -> Asset:
+        """For files and Blender. Raises InputError where no asset can hold the scene."""
+
 
 @dataclass
 class Gaussians4D:

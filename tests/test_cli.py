@@ -11,7 +11,7 @@ import pytest
 from timesplat.cli import COMMANDS, main
 from timesplat.model.io.ply import read_ply, write_ply
 
-from .assets import make_asset
+from .assets import make_asset, tracked_asset
 
 
 def refused(capsys, *argv, says: str, names: str = "") -> None:
@@ -121,6 +121,16 @@ def test_assets_to_export(tmp_path, capsys):
     cut.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n1234")
     refused(capsys, "export", cut, tmp_path / "a.usdc", says="cut.ply")
     assert not (tmp_path / "a.usdc").exists()
+
+
+def test_pieces_are_exported_in_place_of_paths(tmp_path, capsys):
+    write_ply(tmp_path / "a.ply", tracked_asset(9))
+    assert main(["export", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--pieces"]) == 0
+    pieces = read_ply(tmp_path / "b.ply")
+    assert pieces.paths is None and len(pieces) > 9 and f"{len(pieces)} Gaussians" in capsys.readouterr().out
+    for moments in (("s.ply", "--frame", "12"), ("--sequence", "frames")):
+        says = "--pieces is for what has time"
+        refused(capsys, "export", tmp_path / "a.ply", *moments, "--pieces", says=says)
 
 
 def test_other_programs_files_are_exported_and_how_they_lie_is_said(tmp_path, capsys):

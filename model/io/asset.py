@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,8 +74,9 @@ class Asset:
         arrays = {name: getattr(self, name)[rows] for name in ARRAYS}
         if self.paths is None:
             return replace(self, **arrays)
-        used, path = np.unique(self.path[rows], return_inverse=True)
-        return replace(self, **arrays, path=path.astype(np.int32).reshape(-1), paths=self.paths[used])
+        paths, path = self.riding()
+        used, index = np.unique(path[rows], return_inverse=True)
+        return replace(self, **arrays, path=index.astype(np.int32).reshape(-1), paths=paths[used])
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N,3) in normalised space and opacities (N,) 0..1 at a model time (-1..1 over the clip,
@@ -83,9 +86,10 @@ class Asset:
             opacity = self.opacity * np.exp(-0.5 * (dt / self.sigma_t) ** 2)
             if self.paths is None:
                 return self.xyz + self.velocity * dt[:, None], opacity
-        place, turn = self.paths.at(time, self.path)
+        paths, path = self.riding()
+        place, turn = paths.at(time, path)
         offset, _ = self.on_path()
-        return place + rotate(turn, offset), opacity * self.paths.there(time)[self.path]
+        return place + rotate(turn, offset), opacity * paths.there(time)[path]
 
     def rotation_at(self, time: float) -> np.ndarray:
         """(N,4) the rotations at a model time: without paths they do not change."""
@@ -93,10 +97,26 @@ class Asset:
             return self.rotation
         return multiply(self.paths.at(time, self.path)[1], self.on_path()[1])
 
+    def riding(self) -> tuple[Paths, np.ndarray]:
+        """Where there are paths: those, and the row (N,) of them that each Gaussian rides on."""
+        assert self.paths is not None and self.path is not None
+        return self.paths, self.path
+
     def on_path(self) -> tuple[np.ndarray, np.ndarray]:
         """Where there are paths: offsets (N,3) and rotations (N,4) in the moving frames, which do not change."""
-        place, turn = self.paths.at(self.t, self.path)
+        paths, path = self.riding()
+        place, turn = paths.at(self.t, path)
         return rotate(inverse(turn), self.xyz - place), multiply(inverse(turn), self.rotation)
+
+    def path_velocity(self) -> np.ndarray:
+        """(N,3) where there are paths: velocities at their own times, of the half frames before and after together."""
+        (paths, path), (offset, _) = self.riding(), self.on_path()
+        half = np.float32(1 / max(self.clip.frame_end - self.clip.frame_start, 1))
+        before = np.maximum(self.t - half, np.minimum(self.t, paths.start[path]))
+        after = np.minimum(self.t + half, np.maximum(self.t, paths.end[path]))
+        (place, turn), (later, turned) = (paths.at(time, path) for time in (before, after))
+        way = later + rotate(turned, offset) - place - rotate(turn, offset)
+        return way / np.maximum(after - before, np.float32(1e-9))[:, None]
 
     def frame_to_time(self, frame):
         """Model time of a (fractional) frame number of the clip: frame_start is -1, frame_end is +1."""
@@ -138,7 +158,8 @@ def static_asset(source: str | Path, xyz, scale, rotation, rgb, opacity) -> Asse
     n = len(xyz)
     arrays = {"xyz": xyz, "t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
     arrays |= {"scale": scale, "rotation": rotation, "rgb": rgb, "opacity": opacity}
-    asset = Asset(**{k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()}, clip=Clip())
+    exact: dict[str, Any] = {k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()}
+    asset = Asset(**exact, clip=Clip())
     check(asset, source)
     return asset
 
@@ -169,7 +190,7 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
     if np.abs(np.linalg.norm(asset.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
         raise bad("rotation holds quaternions that are not of unit length")
     if asset.paths is not None:
-        _check_paths(asset, bad)
+        _check_paths(asset.paths, asset.path, n, bad)
     c = asset.clip
     with np.errstate(over="ignore"):  # in single precision, as Blender has them
         numbers = np.array([c.fps, c.scale, c.pixel, *c.translation], np.float32)
@@ -181,19 +202,20 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
         raise bad(f"the clip's frames run from {c.frame_start} to {c.frame_end}, which is too many or too far")
 
 
-def _check_paths(asset: Asset, bad) -> None:
-    p, n = asset.paths, len(asset)
+def _check_paths(p: Paths, path: np.ndarray | None, n: int, bad: Callable[[str], InputError]) -> None:
     knots = int(p.count.sum()) if p.count.dtype == np.int32 and p.count.ndim == 1 else -1
     shapes = {"start": (len(p),), "end": (len(p),), "place": (knots, 3), "rotation": (knots, 4)}
     for name, shape in shapes.items():
         a = getattr(p, name)
         if a.dtype != np.float32 or a.shape != shape or not np.isfinite(a).all():
             raise bad(f"its paths' {name} is not a float32 array of shape {shape} without NaN and infinity")
+    if len(p) > MAX_GAUSSIANS:  # a .ply has their numbers as floats
+        raise bad(f"it has more than {MAX_GAUSSIANS:,} paths")
     if not ((p.count >= 1).all() and (p.start < p.end).all()):
         raise bad("it has paths without knots, or that end before they start")
     if np.abs(np.linalg.norm(p.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
         raise bad("its paths hold quaternions that are not of unit length")
-    if asset.path is None or asset.path.shape != (n,) or asset.path.min() < 0 or asset.path.max() >= len(p):
+    if path is None or path.shape != (n,) or path.min() < 0 or path.max() >= len(p):
         raise bad("it has Gaussians on paths that are not there")
 
 

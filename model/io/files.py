@@ -13,6 +13,7 @@ import numpy as np
 
 from ...datagen.sequence import InputError
 from .asset import ARRAYS, MAX_GAUSSIANS, ONE_FRAME_SIGMA, STATIC_SIGMA_T, Asset, Clip, LoadedAsset, check
+from .pieces import to_pieces
 from .ply import write_ply
 from .slices import write_slice
 from .splat_files import read_any_ply, read_splat, read_spz
@@ -45,10 +46,14 @@ def read_asset(path: str | Path, *, fps: float = 24.0, frame_start: int = 1) -> 
     return read_frames(paths, fps=fps, frame_start=frame_start)
 
 
-def write_asset(path: str | Path, asset: Asset, *, frame: float | None = None, **options) -> int:
+def write_asset(path: str | Path, asset: Asset, *, frame: float | None = None, pieces: bool = False, **options) -> int:
     """Writes the whole asset, to a suffix of WRITABLE, or what is visible at a frame (see `slices.write_slice`); the
-    file appears whole or not at all. `options` are those of the format's writer: `write_usd` has some. Returns the
-    number of Gaussians written. Raises InputError."""
+    file appears whole or not at all. `pieces`: straight Gaussians in place of those on paths (see `to_pieces`).
+    `options` are those of the format's writer: `write_usd` has some. Returns the number of Gaussians written. Raises
+    InputError."""
+    if pieces:
+        check(asset, path)
+        asset = to_pieces(asset)
     if frame is not None:
         return write_slice(path, asset, frame, **options)
     writer = WRITERS.get(Path(path).suffix.lower())
@@ -86,7 +91,7 @@ def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: 
         total += n
         ups.add(loaded.up)
         notes.append(loaded.note)
-        if len(ups) > 1 or (asset.sigma_t != STATIC_SIGMA_T).any():
+        if len(ups) > 1 or asset.paths is not None or (asset.sigma_t != STATIC_SIGMA_T).any():
             raise InputError(f"{path}: it is no frame of a sequence (4D already, or of another kind); import it alone.")
         if total > MAX_GAUSSIANS:
             raise InputError(

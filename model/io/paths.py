@@ -34,9 +34,9 @@ class Paths:
         return np.cumsum(self.count, dtype=np.int64) - self.count
 
     def segment(self, time, rows=slice(None)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the paths `rows` (indices, repeats allowed; all of them by default) the knots before and after a time (one,
-        or one for each), int64, and how far it is between them, float32 in 0..1. Beyond its ends a path stays where
-        its end is."""
+        """Of the paths `rows` (indices, repeats allowed; all of them by default) the knots before and after a time
+        (one, or one for each), int64, and how far it is between them, float32 in 0..1. Beyond its ends a path stays
+        where its end is."""
         start, count, first = self.start[rows], self.count[rows], self.first[rows]
         span = np.maximum(self.end[rows] - start, np.float32(1e-9))
         along = np.clip((np.asarray(time, np.float32) - start) / span, 0, 1) * (count - 1)
@@ -62,6 +62,14 @@ class Paths:
         count = self.count[rows]
         knots = np.repeat(self.first[rows] - (np.cumsum(count) - count), count) + np.arange(count.sum())
         return Paths(self.start[rows], self.end[rows], count, self.place[knots], self.rotation[knots])
+
+
+def continuous(rotation: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Knots' quaternions (M,4), as many of each path as `count` (P,) says, with the sign that leads from each knot to
+    the next by the shorter turn; the first knot of each path keeps its own."""
+    agree = np.where((rotation[1:] * rotation[:-1]).sum(1) < 0, -1, 1)
+    sign = np.cumprod(np.concatenate([[1], agree])).astype(rotation.dtype)
+    return rotation * (sign * np.repeat(sign[np.cumsum(count) - count], count))[:, None]
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

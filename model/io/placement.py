@@ -9,13 +9,16 @@ import numpy as np
 
 from ...datagen.sequence import InputError
 from .asset import Asset, rotation_matrices
+from .paths import Paths
+from .pieces import to_pieces
 
 
 def place_asset(asset: Asset, matrix: np.ndarray) -> Asset:
     """The asset whose clip places it where `matrix` (4,4), from normalised space to the world, would: the
     clip's own scale and translation are replaced. Exact for every matrix that can be inverted: a uniform scale
-    and the translation go into the clip, a rotation turns the Gaussians, and anything else (shear, unequal
-    scales, a mirror) makes other Gaussians of them, `softened` before. Raises InputError for a flat one."""
+    and the translation go into the clip, a rotation turns the Gaussians and their paths, and anything else (shear,
+    unequal scales, a mirror) makes other Gaussians of them, `softened` before. But where unequal scales would bend
+    what turns on a path, the path's `to_pieces` are placed. Raises InputError for a flat one."""
     matrix = np.asarray(matrix, np.float64)
     size = np.cbrt(abs(np.linalg.det(matrix[:3, :3]))) if np.isfinite(matrix).all() else 0
     if size < 1e-9:
@@ -25,7 +28,10 @@ def place_asset(asset: Asset, matrix: np.ndarray) -> Asset:
     clip = replace(asset.clip, scale=float(size), translation=(x, y, z))
     if np.abs(A - np.eye(3)).max() < 1e-6:
         return replace(asset, clip=clip)
-    if np.abs(A @ A.T - np.eye(3)).max() < 1e-5 and np.linalg.det(A) > 0:
+    rigid = np.abs(A @ A.T - np.eye(3)).max() < 1e-5  # but for a mirror
+    if asset.paths is not None and not rigid:
+        asset = to_pieces(asset)
+    if rigid and np.linalg.det(A) > 0:
         asset = replace(asset, clip=clip, rotation=rotate_quaternions(A, asset.rotation))
     else:
         asset = replace(asset, clip=clip).softened()
@@ -33,7 +39,15 @@ def place_asset(asset: Asset, matrix: np.ndarray) -> Asset:
         axes[np.linalg.det(axes) < 0, :, 2] *= -1  # a Gaussian has no handedness
         asset = replace(asset, scale=scale.astype(np.float32), rotation=quaternions_from_matrices(axes))
     moved = {k: (getattr(asset, k) @ A.T).astype(np.float32) for k in ("xyz", "velocity")}
-    return replace(asset, **moved)
+    paths = None if asset.paths is None else _turned(asset.paths, A)
+    return replace(asset, paths=paths, **moved)
+
+
+def _turned(paths: Paths, A: np.ndarray) -> Paths:
+    """Paths as an orthogonal matrix (3,3), a mirror as well, has them: their frames turn about other axes."""
+    axis = paths.rotation[:, 1:] @ (np.linalg.det(A) * A.T)
+    rotation = np.concatenate([paths.rotation[:, :1], axis], 1)
+    return replace(paths, place=(paths.place @ A.T).astype(np.float32), rotation=rotation.astype(np.float32))
 
 
 def rest_and_motion(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

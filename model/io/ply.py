@@ -5,6 +5,10 @@ It is a binary little-endian PLY with the property names of 3D Gaussian Splattin
 (every Gaussian at its own time), followed by t, scale_t, vx, vy, vz. Two things are left out: normals, which no splat
 viewer uses, and f_rest_*, because the colour does not depend on the direction. Clip metadata stands in
 `comment timesplat <key> <value>` lines. See `write_ply` for the units.
+
+Where there are paths, each Gaussian has one more property, `path` (a float like all others, for readers that take them
+for granted), and the elements path and knot follow (see ply_paths.py). Such a file is of version 2, because a reader of
+version 1 would pass over them and see straight lines without end.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import numpy as np
 from ...datagen.sequence import InputError
 from .asset import ARRAYS, SH_C0, STATIC_SIGMA_T, Asset, Clip, check
 from .atomic import atomic_write
+from .ply_paths import path_tables, paths_from_tables
 
 POSITION, COLOUR, SCALE = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("scale_0", "scale_1", "scale_2")
 ROTATION, VELOCITY = ("rot_0", "rot_1", "rot_2", "rot_3"), ("vx", "vy", "vz")
@@ -26,13 +31,15 @@ PROPERTIES_3DGS = (*POSITION, *COLOUR, "opacity", *SCALE, *ROTATION)
 PROPERTIES_4D = ("t", "scale_t", *VELOCITY)
 
 OPACITY_MARGIN = 1e-6  # opacities are kept this far from 0 and 1, because they are written as logits
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # that can be read; what has no paths is written as version 1
 MAX_HEADER_BYTES = 1 << 16
 _NUMPY_TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
     **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+_PLY_TYPES = {"<f4": "float", "<i4": "int", "<i2": "short"}
+_CONTENTS = {"vertex": "Gaussians", "path": "paths", "knot": "knots"}
 
 
 # ---------------------------------------------------------------- writing
@@ -44,13 +51,20 @@ def write_ply(path: str | Path, asset: Asset) -> None:
     Positions and velocities are in normalised units (per unit of model time), f_dc = (rgb - 0.5)/SH_C0,
     opacity is a logit, scale_* and scale_t are natural logs, rot_* is w x y z. Reading gives the same
     values back to float32 precision (a relative 1e-6), except that opacities nearer than 1e-6 to 0 or 1
-    are moved to that distance."""
+    are moved to that distance, and that paths are rounded (see ply_paths.py). The velocity of what rides on a path is
+    written as the path has it at the Gaussian's own time."""
     check(asset, path)
+    tables = {} if asset.paths is None else path_tables(asset.paths)
+    if tables:
+        asset = replace(asset, velocity=asset.path_velocity())
     exact = replace(asset, **{name: getattr(asset, name).astype(np.float64) for name in ARRAYS})
     columns = columns_3dgs(exact) | {"t": exact.t, "scale_t": np.log(exact.sigma_t)}
     columns |= dict(zip(VELOCITY, exact.velocity.T, strict=True))
+    if tables:
+        columns["path"] = asset.path
+    comments = [f"timesplat {key} {value}" for key, value in _metadata(asset.clip, 2 if tables else 1)]
     with atomic_write(path) as tmp:
-        tmp.write_bytes(ply_bytes(columns, [f"timesplat {key} {value}" for key, value in _metadata(asset.clip)]))
+        tmp.write_bytes(ply_bytes(columns, comments, **tables))
 
 
 def columns_3dgs(asset: Asset) -> dict[str, np.ndarray]:
@@ -65,18 +79,22 @@ def columns_3dgs(asset: Asset) -> dict[str, np.ndarray]:
     }
 
 
-def ply_bytes(columns: dict[str, np.ndarray], comments: list[str]) -> bytes:
-    """A whole binary .ply with a float property for each of the columns (N,), in their order."""
-    count = len(next(iter(columns.values())))
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
-    header += [f"element vertex {count}", *(f"property float {name}" for name in columns), "end_header", ""]
-    return "\n".join(header).encode("ascii") + np.stack(list(columns.values()), 1).astype("<f4").tobytes()
+def ply_bytes(columns: dict[str, np.ndarray], comments: list[str], **tables: np.ndarray) -> bytes:
+    """A whole binary .ply with a float property for each of the columns (N,), in their order, and after these an
+    element for each of the `tables`, record arrays of _PLY_TYPES."""
+    rows = np.rec.fromarrays(list(columns.values()), [(name, "<f4") for name in columns])
+    header, data = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)], []
+    for element, table in {"vertex": rows, **tables}.items():
+        header.append(f"element {element} {len(table)}")
+        header += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in table.dtype.descr]
+        data.append(table.tobytes())
+    return b"".join(["\n".join([*header, "end_header", ""]).encode("ascii"), *data])
 
 
-def _metadata(clip: Clip) -> list[tuple[str, object]]:
+def _metadata(clip: Clip, version: int) -> list[tuple[str, object]]:
     """What the comments say, by key; `_clip` reads it."""
     return [
-        ("version", FORMAT_VERSION),
+        ("version", version),
         ("fps", float(clip.fps)),
         ("frame_start", clip.frame_start),
         ("frame_end", clip.frame_end),
@@ -96,7 +114,8 @@ def read_ply(path: str | Path) -> Asset:
     properties (normals, f_rest_*) are passed over; quaternions are normalised, zero ones become the
     identity. Raises InputError: one sentence with the file, what is wrong and what to do."""
     path = Path(path)
-    rows, meta = _read_rows(path)
+    tables, meta = _read_tables(path)
+    rows = tables["vertex"]
     moves = _is_4d(rows.dtype.names, path)
     count = len(rows)
 
@@ -127,23 +146,33 @@ def read_ply(path: str | Path) -> Asset:
             "opacity": 1 / (1 + np.exp(-get("opacity"))),
         }
         asset = Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=_clip(meta, path))
+    if "path" in tables:
+        paths, index = paths_from_tables(tables["path"], tables["knot"], path), get("path")
+        if not ((index >= 0) & (index < len(paths)) & (index == np.floor(index))).all():
+            raise InputError(f"{path}: it has Gaussians on paths that are not there; export it again.")
+        asset = replace(asset, path=index.astype(np.int32), paths=paths)
     check(asset, path)
     return asset
 
 
-def _read_rows(path: Path) -> tuple[np.ndarray, dict[str, str]]:
-    """-> the vertices as a record array, and the `comment timesplat` values."""
+def _read_tables(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """-> the vertices as a record array, and the paths and knots where the vertices are on some; and the
+    `comment timesplat` values."""
+    tables = {}
     try:
         with open(path, "rb") as f:
-            dtype, count, meta, offset = _header(f.read(MAX_HEADER_BYTES), path)
+            elements, meta, offset = _header(f.read(MAX_HEADER_BYTES), path)
             have = os.fstat(f.fileno()).st_size - offset
-            if have < count * dtype.itemsize:
-                raise InputError(
-                    f"{path}: the file is truncated, {count} Gaussians were announced and there is data for "
-                    f"{have // dtype.itemsize}; copy or export it again."
-                )
             f.seek(offset)
-            return np.fromfile(f, dtype, count), meta
+            for name, (dtype, count) in elements.items():
+                if have < count * dtype.itemsize:
+                    raise InputError(
+                        f"{path}: the file is truncated, {count} {_CONTENTS[name]} were announced and there is data "
+                        f"for {have // dtype.itemsize}; copy or export it again."
+                    )
+                have -= count * dtype.itemsize
+                tables[name] = np.fromfile(f, dtype, count)
+            return tables, meta
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the name.") from None
     except OSError as e:
@@ -164,39 +193,44 @@ def _is_4d(names: tuple[str, ...], path: Path) -> bool:
     return bool(found)
 
 
-def _header(head: bytes, path: Path) -> tuple[np.dtype, int, dict[str, str], int]:
-    """-> row dtype, number of rows, `comment timesplat` values, where the data begins."""
+def _header(head: bytes, path: Path) -> tuple[dict[str, tuple[np.dtype, int]], dict[str, str], int]:
+    """-> row dtype and number of rows of the elements that count, `comment timesplat` values, where the data begins."""
     if not re.match(rb"ply\r?\n", head):
         raise InputError(f"{path}: it is not a .ply file; choose a Gaussian splat .ply.")
     end = re.search(rb"\nend_header\r?\n", head)
     if end is None:
         raise InputError(f"{path}: the header has no end, the file is truncated; copy or export it again.")
-    order, count, properties, meta, elements = None, 0, [], {}, []
+    order, meta = "", {}
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []  # name, count, (name, type) of the properties
     try:
         for line in head[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
             word = line.split()
             if word[:1] == ["format"]:
-                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(word[1])
-                if order is None:
+                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(word[1], "")
+                if not order:
                     raise InputError(f"{path}: its format is {word[1]}; convert it to a binary .ply.")
             elif word[:2] == ["comment", "timesplat"]:
                 meta[word[2]] = " ".join(word[3:])
             elif word[:1] == ["element"]:
-                elements.append(word[1])
-                if word[1] == "vertex":
-                    count = int(word[2])
-            elif word[:1] == ["property"] and elements[-1] == "vertex":
-                if order is None:
-                    raise ValueError("it names no format")
-                properties.append((word[2], order + _NUMPY_TYPES[word[1]]))
-        if elements[:1] != ["vertex"]:
-            first = elements[0] if elements else "nothing"
+                elements.append((word[1], int(word[2]), []))
+            elif word[:1] == ["property"]:
+                elements[-1][2].append((word[2], word[1]))
+        if not elements or elements[0][0] != "vertex":
+            first = elements[0][0] if elements else "nothing"
             raise InputError(
                 f"{path}: its first element is {first}, not vertex; export it as an uncompressed 3DGS .ply."
             )
-        if count < 0 or not properties:
-            raise ValueError("no vertices")
-        return np.dtype(properties), count, meta, end.end()
+        if not order:
+            raise ValueError("it names no format")
+        on_paths = "path" in dict(elements[0][2])
+        if on_paths and [name for name, *_ in elements[1:3]] != ["path", "knot"]:
+            raise InputError(f"{path}: its Gaussians are on paths that it lacks; export it again from Timesplat.")
+        found = {}
+        for name, count, properties in elements[: 3 if on_paths else 1]:
+            if count < 0 or not properties:
+                raise ValueError(f"no {_CONTENTS[name]}")
+            found[name] = np.dtype([(prop, order + _NUMPY_TYPES[kind]) for prop, kind in properties]), count
+        return found, meta, end.end()
     except InputError:
         raise
     except (ValueError, KeyError, IndexError, TypeError) as e:

@@ -29,7 +29,8 @@ def slice_at(asset: Asset, frame: float, cut: float = VISIBLE) -> Asset:
     stays, because empty files are refused by many."""
     clip = asset.clip
     held = min(max(frame, clip.frame_start), clip.frame_end)
-    xyz, opacity = asset.at(clip.frame_to_time(held))
+    time = clip.frame_to_time(held)
+    xyz, opacity = asset.at(time)
     seen = opacity >= cut
     seen[opacity.argmax()] |= not seen.any()
     world = xyz[seen] * np.float32(clip.scale) + np.array(clip.translation, np.float32)
@@ -37,7 +38,7 @@ def slice_at(asset: Asset, frame: float, cut: float = VISIBLE) -> Asset:
         "the slice",
         xyz=world @ MINUS_Y_UP.T,
         scale=asset.soft_scale()[seen] * np.float32(clip.scale),
-        rotation=rotate_quaternions(MINUS_Y_UP, asset.rotation[seen]),
+        rotation=rotate_quaternions(MINUS_Y_UP, asset.rotation_at(time)[seen]),
         rgb=asset.rgb[seen],
         opacity=opacity[seen],
     )

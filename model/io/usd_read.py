@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from .asset import (
     check,
     wxyz_from_xyzw,
 )
+from .paths import Paths, continuous
 from .placement import place_asset, rest_and_motion
 from .usd_stage import (
     RECONSTRUCTION,
@@ -73,14 +75,14 @@ def _read(path: Path) -> tuple[Asset, np.ndarray | None]:
     return _in_the_world(asset, path, stage, found[0])
 
 
-def _values(path: Path, prim, *names: str, code=None) -> np.ndarray:
-    """The first of the attributes that has a value, as float32, at a time code or else at the first one."""
+def _values(path: Path, prim, *names: str, code=None, dtype: type = np.float32) -> np.ndarray:
+    """The first of the attributes that has a value, at a time code or else at the first one."""
     for name in names:
         attribute = prim.GetAttribute(name)
         at = import_pxr().Usd.TimeCode.EarliestTime() if code is None else code
         value = attribute.Get(at) if attribute else None
         if value is not None:
-            return np.asarray(value).astype(np.float32)
+            return np.asarray(value).astype(dtype)
     raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
 
 
@@ -109,22 +111,35 @@ def _read_4d(path: Path, stage, prim) -> Asset:
         start, *_, end = prim.GetAttribute("gs4d:time").GetTimeSamples() * 2  # one sample, where the clip is one frame
     t, velocity, sigma_t = (get(f"primvars:gs4d:{name}") for name in ("mu_t", "velocity", "sigma_t"))
     clip = _clip(path, stage, start, end, pixel=prim.GetCustomDataByKey("timesplat:pixel") or 0.0)
+    tracks = _tracks(path, prim) if prim.HasAttribute("primvars:gs4d:path") else {}
     first, last = clip.frame_start, clip.frame_end
     if last > first and (first, last) != (start, end):  # retimed to fractional frames
         stretch = np.float32((end - start) / (last - first))
-        t = (t + 1) * stretch + np.float32(2 * (start - first) / (last - first) - 1)
-        velocity, sigma_t = velocity / stretch, sigma_t * stretch
+        shift = np.float32(2 * (start - first) / (last - first) - 1)
+        t = (t + 1) * stretch + shift
+        velocity, sigma_t = velocity / stretch, sigma_t if tracks else sigma_t * stretch
+        if tracks:
+            ends = {name: (getattr(tracks["paths"], name) + 1) * stretch + shift for name in ("start", "end")}
+            tracks["paths"] = replace(tracks["paths"], **ends)
     return Asset(
         xyz=get("primvars:gs4d:position"),
         t=t,
         velocity=velocity,
         sigma_t=sigma_t,
         scale=get("primvars:gs4d:scale"),
-        rotation=_unit(wxyz_from_xyzw(get("orientations", "orientationsh", "primvars:gs4d:rotation"))),
+        rotation=_unit(wxyz_from_xyzw(get("primvars:gs4d:rotation", "orientations", "orientationsh"))),
         rgb=rgb,
         opacity=get("primvars:gs4d:opacity"),
         clip=clip,
+        **tracks,
     )
+
+
+def _tracks(path: Path, prim) -> dict[str, Any]:
+    """Asset's `path` and `paths`."""
+    index, count = (_values(path, prim, name, dtype=np.int32) for name in ("primvars:gs4d:path", "gs4d:paths:knots"))
+    start, end, place, turn = (_values(path, prim, f"gs4d:paths:{n}") for n in ("start", "end", "place", "rotation"))
+    return {"path": index, "paths": Paths(start, end, count, place, continuous(_unit(wxyz_from_xyzw(turn)), count))}
 
 
 def _unit(quaternion: np.ndarray) -> np.ndarray:

@@ -9,9 +9,11 @@ gives the Asset back, and `gs4d:time` is the time they are in: -1 at the clip's 
 that a layer offset moves it with the samples. Needs numpy and pxr (usd-core). docs/pipelines.md is for those
 who read the files.
 
-What is sampled over time
-    positions   two samples where that says it all; one a frame, with |t - μ_t| held within HOLD_SIGMAS·σ_t, where
-                a short-lived Gaussian's line would leave the box long after it has faded, or in mode frames.
+What is sampled over time (see usd_samples.py)
+    positions   two samples where that says it all; one a frame where there are paths, in mode frames, and, with
+                |t - μ_t| held within HOLD_SIGMAS·σ_t, where a short-lived Gaussian's line would leave the box long
+                after it has faded.
+    orientations  one a frame where a path turns
     opacities   one a frame, rounded to 1/1000: so few different values are stored as a table, which makes
                 the file a third of the size. The exact ones can be had from primvars:gs4d:*.
     widths      one a frame: 0 while the Gaussian is invisible, so that a viewer of mere points shows
@@ -32,9 +34,11 @@ from pathlib import Path
 import numpy as np
 
 from ...datagen.sequence import InputError
-from .asset import SH_C0, VISIBLE, Asset, Clip, check, linear_from_srgb, rotation_matrices, xyzw_from_wxyz
+from .asset import SH_C0, Asset, Clip, check, linear_from_srgb, xyzw_from_wxyz
 from .atomic import atomic_write
+from .paths import Paths
 from .usd_original import add_original
+from .usd_samples import extent_of, orientations, positions, widths
 from .usd_stage import (
     ORIGINAL,
     RECONSTRUCTION,
@@ -50,9 +54,6 @@ from .usd_stage import (
 )
 
 MODES = ("splats", "points", "frames")
-MAX_STRAY = 5.0  # how far, in normalised units, an invisible point may be before positions are sampled per frame
-HOLD_SIGMAS = 4.0  # lifetimes after which a Gaussian stands still: exp(-½·4²) rounds to an opacity of 0
-EXTENT_SIGMAS = 3.0
 HALF_TINY, HALF_MAX = 2.0**-14, 65504.0
 
 
@@ -118,7 +119,7 @@ def write_usd(
 def _stage(asset: Asset, mode: str, half: bool, path: Path, motion: np.ndarray | None, variants: bool):
     """The whole file as a Usd.Stage in memory; the variant for the original, if there are `variants`, is empty."""
     pxr = import_pxr()
-    positions, extent = _positions(asset, mode == "frames", path), _extent(asset)
+    places, extent = positions(asset, mode == "frames", path), extent_of(asset)
     stage = pxr.Usd.Stage.CreateInMemory()
     root = stage.DefinePrim(ROOT_PATH, "Xform")
     stage.SetDefaultPrim(root)
@@ -136,7 +137,7 @@ def _stage(asset: Asset, mode: str, half: bool, path: Path, motion: np.ndarray |
             stack.enter_context(choice.GetVariantEditContext())
         hint = pxr.Vt.Vec3fArray.FromNumpy(_extents_hint(extent, asset.clip, motion))
         root.CreateAttribute("extentsHint", pxr.Sdf.ValueTypeNames.Float3Array, False).Set(hint)
-        _author(stage, asset, mode, half, positions, extent, motion)
+        _author(stage, asset, mode, half, places, extent, motion)
     return stage
 
 
@@ -155,33 +156,31 @@ def _set_metadata(stage, clip: Clip) -> None:
 
 
 def _author(
-    stage, asset: Asset, mode: str, half: bool, positions: dict, extent: np.ndarray, motion: np.ndarray | None
+    stage, asset: Asset, mode: str, half: bool, places: dict, extent: np.ndarray, motion: np.ndarray | None
 ) -> None:
-    """The prim of the Gaussians; positions as of `_positions`, extent (2,3)."""
+    """The prim of the Gaussians; places as of `positions`, extent (2,3)."""
     prim = _Prim(stage.DefinePrim(SPLATS_PATH, "Points" if mode == "points" else SPLAT_TYPE), half)
     types = prim.types
     _author_transform(prim, asset.clip, motion)
-    positions = {code: prim.float3(p) for code, p in positions.items()}
-    if len(positions) == 1:
-        (positions,) = positions.values()
+    points = _changing(prim.float3, places)
     curve = {float(f): asset.at(asset.frame_to_time(f))[1] for f in asset.clip.frames}
     opacities = _changing(prim.float1, {code: np.round(o * 1000) / 1000 for code, o in curve.items()})
-    widths = _changing(prim.float1, _widths(asset, curve))
 
-    prim.put("points", types.Point3fArray, positions)
-    prim.put("widths", types.FloatArray, widths)
+    prim.put("points", types.Point3fArray, points)
+    prim.put("widths", types.FloatArray, _changing(prim.float1, widths(asset, curve)))
     prim.put("primvars:displayColor", types.Color3fArray, prim.float3(linear_from_srgb(asset.rgb)))
     prim.put("primvars:displayOpacity", types.FloatArray, opacities)
     prim.put("extent", types.Float3Array, prim.float3(extent))
     prim.prim.SetCustomDataByKey("timesplat:pixel", float(asset.clip.pixel))
     prim.put_vectors("primvars:gs4d:scale", prim.not_tiny(asset.scale))  # stored once where both are the same
-    if mode == "points":
+    if mode == "points" or asset.paths is not None:
         prim.put_quaternions("primvars:gs4d:rotation", asset.rotation)
+    if mode == "points":
         prim.put_vectors("primvars:gs4d:rgb", asset.rgb)
     else:
-        prim.put("positions", types.Point3fArray, positions)
+        prim.put("positions", types.Point3fArray, points)
         prim.put_vectors(f"scales{prim.suffix}", prim.not_tiny(asset.soft_scale()))
-        prim.put_quaternions(f"orientations{prim.suffix}", asset.rotation)
+        prim.put_quaternions(f"orientations{prim.suffix}", orientations(asset))
         prim.put("opacities", types.FloatArray, opacities)  # stored once, with displayOpacity
         prim.put("radiance:sphericalHarmonicsDegree", types.Int, 0, uniform=True)
         prim.put_vectors(f"{SH_COEFFICIENTS}{prim.suffix}", (asset.rgb - 0.5) / SH_C0)
@@ -202,14 +201,27 @@ def _author_transform(prim: _Prim, clip: Clip, motion: np.ndarray | None) -> Non
 
 def _author_parameters(prim: _Prim, asset: Asset) -> None:
     """What `read_usd` gives the Asset back from, but for scale, rotation and colour."""
-    velocity = np.clip(asset.velocity, -HALF_MAX, HALF_MAX) if prim.half else asset.velocity
+    velocity = asset.velocity if asset.paths is None else asset.path_velocity()
+    velocity = np.clip(velocity, -HALF_MAX, HALF_MAX) if prim.half else velocity
     prim.put("primvars:gs4d:position", prim.types.Float3Array, prim.float3(asset.xyz))
     prim.put_vectors("primvars:gs4d:velocity", velocity)
     prim.put_numbers("primvars:gs4d:mu_t", asset.t)
     prim.put_numbers("primvars:gs4d:sigma_t", prim.not_tiny(asset.sigma_t))
     prim.put_numbers("primvars:gs4d:opacity", asset.opacity)
+    if asset.paths is not None:
+        _author_paths(prim, *asset.riding())
     ends = (asset.clip.frame_start, asset.clip.frame_end)
     prim.put("gs4d:time", prim.types.Double, {float(f): float(asset.frame_to_time(f)) for f in ends})
+
+
+def _author_paths(prim: _Prim, paths: Paths, path: np.ndarray) -> None:
+    """Arrays of paths and knots are no primvars: those have a value for each point."""
+    prim.put("primvars:gs4d:path", prim.types.IntArray, prim.int1(path))
+    prim.put("gs4d:paths:start", prim.types.FloatArray, prim.float1(paths.start))
+    prim.put("gs4d:paths:end", prim.types.FloatArray, prim.float1(paths.end))
+    prim.put("gs4d:paths:knots", prim.types.IntArray, prim.int1(paths.count))
+    prim.put("gs4d:paths:place", prim.types.Float3Array, prim.float3(paths.place))
+    prim.put_quaternions("gs4d:paths:rotation", paths.rotation)
 
 
 class _Prim:
@@ -243,13 +255,21 @@ class _Prim:
     def put_vectors(self, name: str, a: np.ndarray) -> None:
         self._put_array(name, self.vectors, a)
 
-    def put_quaternions(self, name: str, q: np.ndarray) -> None:
-        """q (N,4) w x y z."""
-        self._put_array(name, self.quaternions, xyzw_from_wxyz(q))  # as FromNumpy takes them
+    def put_quaternions(self, name: str, q: np.ndarray | dict[float, np.ndarray]) -> None:
+        """q (N,4) w x y z, or {time code: such}."""
+        kind, array = self.quaternions
+
+        def to(q: np.ndarray):
+            return array.FromNumpy(np.ascontiguousarray(xyzw_from_wxyz(q), self.dtype))  # as it takes them
+
+        self.put(name, kind, _changing(to, q) if isinstance(q, dict) else to(q))
 
     def _put_array(self, name: str, kind_and_array: tuple, a: np.ndarray) -> None:
         kind, array = kind_and_array
         self.put(name, kind, array.FromNumpy(np.ascontiguousarray(a, self.dtype)))
+
+    def int1(self, a: np.ndarray):
+        return self.Vt.IntArray.FromNumpy(np.ascontiguousarray(a, np.int32))
 
     def float1(self, a: np.ndarray):
         return self.Vt.FloatArray.FromNumpy(np.ascontiguousarray(a, np.float32))
@@ -262,60 +282,12 @@ class _Prim:
         return np.clip(a, HALF_TINY, HALF_MAX) if self.half else a
 
 
-def _positions(asset: Asset, every: bool, path: Path) -> dict[float, np.ndarray]:
-    """{time code: (N,3)}: one sample if nothing moves, two if no line leaves the box, else (or if `every`)
-    one a frame."""
-    clip = asset.clip
-
-    def held(time: float) -> np.ndarray:
-        dt = np.clip(np.float32(time) - asset.t, -HOLD_SIGMAS * asset.sigma_t, HOLD_SIGMAS * asset.sigma_t)
-        return asset.xyz + asset.velocity * dt[:, None]
-
-    if clip.frame_start == clip.frame_end or not asset.velocity.any():
-        return {float(clip.frame_start): asset.at(0.0)[0] if asset.velocity.any() else asset.xyz}
-    with np.errstate(over="ignore", invalid="ignore"):
-        ends = {float(f): asset.at(t)[0] for f, t in ((clip.frame_start, -1.0), (clip.frame_end, 1.0))}
-        astray = [(np.abs(p) > MAX_STRAY) & (p != held(t)) for p, t in zip(ends.values(), (-1, 1), strict=True)]
-        samples = ends
-        if every or any(a.any() for a in astray):
-            samples = {float(f): held(asset.frame_to_time(f)) for f in clip.frames}
-    if not all(np.isfinite(p).all() for p in samples.values()):
-        raise InputError(f"{path}: velocity is so large that positions overflow; reconstruct it again.")
-    return samples
-
-
-def _widths(asset: Asset, curve: dict[float, np.ndarray]) -> dict[float, np.ndarray]:
-    """Diameters for readers of points: twice the middle standard deviation, which covers a flat splat's
-    face, rounded to 256 steps of its logarithm (few values make a small file); 0 while invisible."""
-    middle = np.log(np.sort(asset.soft_scale(), axis=1)[:, 1])
-    step = max((middle.max() - middle.min()) / 255, 1e-9)
-    width = 2 * np.exp(np.round((middle - middle.min()) / step) * step + middle.min())
-    return {code: np.where(o >= VISIBLE, width, 0).astype(np.float32) for code, o in curve.items()}
-
-
 def _changing(to, samples: dict[float, np.ndarray]):
     """The samples through `to`; one plain value where all of them are the same."""
     first, *rest = samples.values()
     if all(np.array_equal(first, r) for r in rest):
         return to(first)
     return {code: to(a) for code, a in samples.items()}
-
-
-def _extent(asset: Asset) -> np.ndarray:
-    """(2,3) bounds of all Gaussians (three sigmas) at the frames where they are visible; of all of them at
-    their own times if none ever is."""
-    M = rotation_matrices(asset.rotation) * asset.soft_scale()[:, None, :]
-    reach = EXTENT_SIGMAS * np.sqrt((M**2).sum(-1))
-    low, high = [], []
-    for frame in asset.clip.frames:
-        position, opacity = asset.at(asset.frame_to_time(frame))
-        seen = opacity >= VISIBLE
-        if seen.any():
-            low.append((position - reach)[seen].min(0))
-            high.append((position + reach)[seen].max(0))
-    if not low:
-        return np.stack([(asset.xyz - reach).min(0), (asset.xyz + reach).max(0)])
-    return np.stack([np.min(low, 0), np.max(high, 0)])
 
 
 def _extents_hint(extent: np.ndarray, clip: Clip, motion: np.ndarray | None) -> np.ndarray:

@@ -4,7 +4,7 @@
 import pytest
 import torch
 
-from timesplat.datagen.sequence import read_sequence
+from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.evaluation import protocol, scoring
 from timesplat.evaluation.image_quality import psnr
 from timesplat.evaluation.loading import load_inputs, load_truth
@@ -59,6 +59,9 @@ class Frozen:
     def __getitem__(self, index):
         return Frozen(self.g[index])
 
+    def to_asset(self, clip):
+        raise InputError("its Gaussians are on no paths of ours; evaluate it.")
+
     def alive(self):
         return self.g.alive()
 
@@ -92,3 +95,9 @@ def test_what_a_scene_costs(seq, evaluated):
         found = costs(evaluated("lift")[1], load_inputs(seq, range(24), True), truth, spec, seq)
         assert tuple(found) == COSTS and (found["coverage"] is not None) == covered
         assert found["ply_mb"] > 0.01 and found["render_ms"] > 0
+
+
+def test_what_no_asset_can_hold_has_no_megabytes(seq, evaluated):
+    _, scene = evaluated("lift")
+    assert scoring.megabytes(Frozen(scene), seq) == (None, None)
+    assert scoring.megabytes(scene, seq)[0] > 0.01

@@ -7,6 +7,7 @@ import re
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +16,12 @@ from timesplat.datagen.sequence import InputError
 from timesplat.model.io import files
 from timesplat.model.io.asset import STATIC_SIGMA_T, VISIBLE, Clip, LoadedAsset
 from timesplat.model.io.files import READABLE, WRITABLE, frame_files, read_asset, read_frames, write_asset
+from timesplat.model.io.pieces import to_pieces
 from timesplat.model.io.ply import write_ply
 from timesplat.model.io.slices import SLICE_FORMATS, write_slice
 from timesplat.model.io.usd_stage import USD_SUFFIXES
 
-from ...assets import assert_same, make_asset
+from ...assets import assert_same, make_asset, tracked_asset
 
 SPZ = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20))  # one Gaussian, Y up
 
@@ -54,8 +56,9 @@ def test_what_is_no_sequence_is_refused(tmp_path, monkeypatch):
     for name in ("a.ply", "b.ply"):
         write_slice(tmp_path / name, asset, 5)
     write_ply(tmp_path / "four.ply", asset)
+    write_ply(tmp_path / "tracked.ply", tracked_asset(9))
     (tmp_path / "up.spz").write_bytes(SPZ)
-    for other in ("four.ply", "up.spz"):
+    for other in ("four.ply", "tracked.ply", "up.spz"):
         with pytest.raises(InputError, match=f"{other}: it is no frame of a sequence .* import it alone"):
             read_frames([tmp_path / "a.ply", tmp_path / other])
     with pytest.raises(InputError, match="USD files hold their frames themselves; import them one by one"):
@@ -102,6 +105,18 @@ def test_what_is_written_is_read_back(tmp_path, suffix):
     loaded = read_asset(path)
     assert (loaded.up, loaded.note, loaded.motion) == ("Z", "", None)
     assert_same(asset, loaded.asset)
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_pieces_are_written_in_place_of_paths(tmp_path, suffix):
+    if suffix in USD_SUFFIXES:
+        pytest.importorskip("pxr")
+    asset, path = tracked_asset(), tmp_path / f"a{suffix}"
+    pieces = to_pieces(asset)
+    assert write_asset(path, asset, pieces=True) == len(pieces) > len(asset)
+    assert_same(pieces, read_asset(path).asset)
+    with pytest.raises(InputError, match="rgb holds NaN"):
+        write_asset(path, replace(asset, rgb=asset.rgb * np.float32("nan")), pieces=True)
 
 
 @pytest.mark.parametrize("suffix", SLICE_FORMATS)

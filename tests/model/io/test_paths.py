@@ -8,7 +8,9 @@ import pytest
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.io.asset import STATIC_SIGMA_T, Asset, check, rotation_matrices
-from timesplat.model.io.paths import Paths, inverse, multiply, rotate
+from timesplat.model.io.paths import Paths, continuous, inverse, multiply, rotate
+
+from ...assets import tracked_asset
 
 RNG = np.random.default_rng(0)
 
@@ -37,7 +39,8 @@ def riding(paths: Paths, n=6) -> Asset:
     xyz, t = RNG.normal(size=(n, 3)).astype(np.float32), np.linspace(-0.5, 0.5, n).astype(np.float32)
     one = np.ones(n, np.float32)
     zero, grey = np.zeros((n, 3), np.float32), np.full((n, 3), 0.5, np.float32)
-    return Asset(xyz, t, zero, STATIC_SIGMA_T * one, 0.1 * grey, quaternions(n), grey, 0.5 * one, path=path, paths=paths)
+    sigma_t, opacity = STATIC_SIGMA_T * one, 0.5 * one
+    return Asset(xyz, t, zero, sigma_t, 0.1 * grey, quaternions(n), grey, opacity, path=path, paths=paths)
 
 
 def test_between_knots_by_hand():
@@ -110,9 +113,38 @@ def test_wrong_paths_are_refused():
             check(replace(a, **wrong))
 
 
+def test_more_paths_than_a_file_can_number_are_refused(monkeypatch):
+    monkeypatch.setattr("timesplat.model.io.asset.MAX_GAUSSIANS", 2)
+    with pytest.raises(InputError, match="more than 2 paths"):
+        check(riding(three()))
+
+
 def test_quaternions_against_matrices():
     a, b, v = quaternions(9), quaternions(9), RNG.normal(size=(9, 3))
     A, B = rotation_matrices(a), rotation_matrices(b)
     assert np.allclose(rotation_matrices(multiply(a, b)), A @ B, atol=1e-5)
     assert np.allclose(rotate(a, v), (A @ v[..., None])[..., 0], atol=1e-5)
     assert np.allclose(rotate(inverse(a), rotate(a, v)), v, atol=1e-5)
+
+
+def test_signs_that_lead_the_shorter_way():
+    q, count = quaternions(9), np.array([1, 5, 3])
+    turned = continuous(q, count)
+    assert np.array_equal(np.abs(turned), np.abs(q)) and np.array_equal(turned[[0, 1, 6]], q[[0, 1, 6]])
+    for i, j in ((1, 6), (6, 9)):
+        assert ((turned[i + 1 : j] * turned[i : j - 1]).sum(1) >= 0).all()
+    assert np.array_equal(continuous(turned, count), turned)
+
+
+def test_velocities_at_own_times():
+    """Against smaller steps where the path goes on as it does, and at its ends, where there is one side alone."""
+    a = tracked_asset(40, (2, 2), turn=0)
+    want = (a.paths.place[1::2] - a.paths.place[::2]) / (a.paths.end - a.paths.start)[:, None]
+    for t in (a.t, a.paths.start[a.path], a.paths.end[a.path]):
+        b = replace(a, t=t, xyz=a.xyz.copy())
+        assert np.allclose(b.path_velocity(), want[a.path], atol=1e-5)
+    b = tracked_asset(40, (7,))
+    half = 1 / (len(b.clip.frames) - 1)
+    for i in np.flatnonzero(np.abs(b.t) < 0.9):
+        way = b.at(float(b.t[i]) + half)[0][i] - b.at(float(b.t[i]) - half)[0][i]
+        assert np.allclose(b.path_velocity()[i], way / (2 * half), atol=1e-4)

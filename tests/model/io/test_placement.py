@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """An asset at another place in the world."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.io.asset import ARRAYS, Asset, Clip, check, rotation_matrices
+from timesplat.model.io.pieces import to_pieces
 from timesplat.model.io.placement import place_asset, rest_and_motion
 
-from ...assets import make_asset
+from ...assets import make_asset, tracked_asset
 
 CLIP = Clip(25.0, 3, 12, 2.5, (1.0, -2.0, 3.0), pixel=0.02)
 
@@ -47,6 +50,32 @@ def test_placed_is_the_matrix(A):
     want = A @ covariance(asset.softened()) @ A.T
     got = covariance(out.softened()) * c.scale**2
     np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-6 * np.abs(want).max())
+
+
+@pytest.mark.parametrize("A", [rotation_of(1) * 0.2, np.diag([-2.0, 2, 2]), -3 * rotation_of(5)])
+def test_paths_are_placed_too(A):
+    """At every moment, those of Gaussians that turn: rotated, and in a mirror."""
+    asset, M = tracked_asset(30, clip=CLIP, turn=0.5), np.eye(4)
+    M[:3, :3], M[:3, 3] = A, [4, 5, -6]
+    out = place_asset(asset, M)
+    check(out)
+    assert len(out.paths) == len(asset.paths)
+    np.testing.assert_allclose(out.path_velocity(), out.velocity, atol=1e-4)
+    for time in (-1.0, -0.4, 0.3, 1.0):
+        (p, o), (q, u) = asset.at(time), out.at(time)
+        np.testing.assert_allclose(q * out.clip.scale + out.clip.translation, p @ A.T + [4, 5, -6], atol=2e-5)
+        np.testing.assert_array_equal(o, u)
+        before, after = (covariance(replace(a.softened(), rotation=a.rotation_at(time))) for a in (asset, out))
+        want = A @ before @ A.T
+        np.testing.assert_allclose(after * out.clip.scale**2, want, rtol=1e-3, atol=1e-5 * np.abs(want).max())
+
+
+def test_what_turns_is_placed_by_unequal_scales_in_pieces():
+    asset = tracked_asset(30, clip=CLIP, turn=0.5)
+    out, want = place_asset(asset, np.diag([1.0, 2, 3, 1])), to_pieces(asset)
+    assert out.paths is None and out.path is None
+    scale, translation = out.clip.scale, out.clip.translation
+    np.testing.assert_allclose(out.at(0.2)[0] * scale + translation, want.at(0.2)[0] * [1, 2, 3], atol=1e-4)
 
 
 def test_placed_leaves_alone_what_needs_no_change():

@@ -14,7 +14,7 @@ from timesplat.model.io.asset import SH_C0, VISIBLE, Clip, rotation_matrices
 from timesplat.model.io.files import read_asset
 from timesplat.model.io.slices import write_slice, write_slices
 
-from ...assets import make_asset
+from ...assets import make_asset, tracked_asset
 
 CLIP = Clip(25.0, 3, 12, 2.5, (1.0, -2.0, 3.0), pixel=0.02)
 DOWN = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # a slice's axes from the world's: Z up becomes -Y up
@@ -39,6 +39,20 @@ def test_a_slice_is_the_asset_at_its_time(tmp_path, frame):
     np.testing.assert_allclose(turned, DOWN @ rotation_matrices(asset.rotation[seen]), atol=1e-5)
     names = [p.name for p in rows.properties]
     assert "t" not in names and not any(n.startswith("f_rest") for n in names)
+
+
+@pytest.mark.parametrize("frame", [3, 7.25, 12])
+def test_a_slice_of_what_rides_on_paths_has_their_turn(tmp_path, frame):
+    asset = tracked_asset(60, clip=CLIP, turn=0.5)
+    time = asset.frame_to_time(frame)
+    count = write_slice(tmp_path / "s.ply", asset, frame)
+    seen = asset.paths.there(time)[asset.path] & (asset.opacity >= VISIBLE)
+    got = read_asset(tmp_path / "s.ply").asset
+    assert count == seen.sum() and got.paths is None
+    np.testing.assert_allclose(got.xyz, (asset.at(time)[0][seen] * 2.5 + [1, -2, 3]) @ DOWN.T, atol=5e-6)
+    turned = DOWN @ rotation_matrices(asset.rotation_at(time)[seen])
+    np.testing.assert_allclose(rotation_matrices(got.rotation), turned, atol=1e-5)
+    assert np.abs(turned - DOWN @ rotation_matrices(asset.rotation[seen])).max() > 0.1
 
 
 def test_a_slice_as_splat_is_the_same_to_its_bytes(tmp_path):

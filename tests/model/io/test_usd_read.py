@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pxr")
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.io.asset import rotation_matrices
@@ -13,7 +13,7 @@ from timesplat.model.io.usd_read import read_usd, read_usd_with_motion
 from timesplat.model.io.usd_stage import SPLAT_TYPE
 from timesplat.model.io.usd_write import write_usd
 
-from ...assets import make_asset
+from ...assets import assert_same, make_asset, tracked_asset
 from ...usd_helpers import open_splats, run_child, write_foreign
 
 FUZZ = """
@@ -47,11 +47,12 @@ print("RESULT" + str(refused))
 """
 
 
+@pytest.mark.parametrize("asset", [make_asset(30), tracked_asset(30)], ids=["lines", "paths"])
 @pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
-def test_damaged_files_are_refused_or_read(tmp_path, suffix):
+def test_damaged_files_are_refused_or_read(tmp_path, suffix, asset):
     """Nothing but an InputError comes out of 40 damaged copies. (Without a limit to memory the library itself takes
     what a damaged file claims to need.)"""
-    write_usd(tmp_path / f"a{suffix}", make_asset(30))
+    write_usd(tmp_path / f"a{suffix}", asset)
     assert int(run_child(FUZZ, tmp_path / f"a{suffix}")) > 10
 
 
@@ -174,3 +175,62 @@ def test_a_mirrored_asset_is_read_as_it_is_seen(tmp_path):
     before = rotation_matrices(asset.rotation) * asset.soft_scale()[:, None] * [[[-2], [4], [2]]]
     after = rotation_matrices(back.rotation) * back.soft_scale()[:, None] * back.clip.scale
     np.testing.assert_allclose(after @ after.transpose(0, 2, 1), before @ before.transpose(0, 2, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "word"),
+    [
+        ("primvars:gs4d:path", None, "paths that are not there|is missing"),
+        ("primvars:gs4d:path", [7] * 30, "paths that are not there"),
+        ("primvars:gs4d:path", [-1] * 30, "paths that are not there"),
+        ("primvars:gs4d:path", [0] * 29, "paths that are not there"),
+        ("gs4d:paths:start", None, "gs4d:paths:start is missing"),
+        ("gs4d:paths:start", [2] * 4, "end before they start"),
+        ("gs4d:paths:end", [float("nan")] * 4, "end is not a float32 array"),
+        ("gs4d:paths:end", [1] * 3, "end is not a float32 array"),
+        ("gs4d:paths:knots", [1, 2, 5, 25], "damaged|place is not"),
+        ("gs4d:paths:knots", [1, 2, 5, -24], "damaged"),
+        ("gs4d:paths:knots", [0, 3, 5, 24], "paths without knots"),
+        ("gs4d:paths:place", [(0, 0, 0)] * 31, "place is not a float32 array"),
+        ("gs4d:paths:rotation", None, "gs4d:paths:rotation is missing"),
+    ],
+)
+def test_damaged_paths_are_told_in_a_sentence(tmp_path, name, value, word):
+    write_usd(tmp_path / "a.usda", tracked_asset(30))
+    stage, prim = open_splats(tmp_path / "a.usda")
+    if value is None:
+        prim.GetAttribute(name).Clear()
+    else:
+        prim.GetAttribute(name).Set(value)
+    stage.Save()
+    with pytest.raises(InputError, match=word) as e:
+        read_usd(tmp_path / "a.usda")
+    assert "a.usda" in str(e.value) and "\n" not in str(e.value)
+
+
+def test_paths_in_a_shot_that_is_placed_and_retimed(tmp_path):
+    """Turned by a right angle, moved, two and a half times as slow: where the stage has it, when the stage has it."""
+    asset = tracked_asset(40, turn=0.5)
+    write_usd(tmp_path / "a.usdc", asset)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    stage.SetTimeCodesPerSecond(30)
+    shot = stage.DefinePrim("/fox", "Xform")
+    shot.GetReferences().AddReference("./a.usdc", layerOffset=Sdf.LayerOffset(100, 2.5))
+    UsdGeom.Xformable(shot).AddTranslateOp().Set((5, 0, 0))
+    UsdGeom.Xformable(shot).AddRotateZOp().Set(90)
+    stage.Save()
+    back = read_usd(tmp_path / "shot.usda")
+    for frame in (10, 16.4, 33):
+        want, opacity = asset.at(asset.frame_to_time(frame))
+        got, seen = back.at(back.frame_to_time(100 + 2.5 * frame))
+        want = (want * 2 + [1, 2, 3]) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + [5, 0, 0]
+        np.testing.assert_allclose(got * back.clip.scale + back.clip.translation, want, atol=1e-4)
+        np.testing.assert_allclose(seen, opacity, atol=1e-6)
+
+
+def test_what_rides_on_paths_is_written_again_as_it_was(tmp_path):
+    write_usd(tmp_path / "a.usdc", tracked_asset(30))
+    write_usd(tmp_path / "b.usdc", read_usd(tmp_path / "a.usdc"))
+    assert_same(read_usd(tmp_path / "a.usdc"), read_usd(tmp_path / "b.usdc"), 1e-6, 1e-6)

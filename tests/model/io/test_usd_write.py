@@ -13,14 +13,21 @@ pytest.importorskip("pxr")
 from pxr import Usd, UsdGeom, Vt
 
 from timesplat.datagen.sequence import InputError
-from timesplat.model.io.asset import ARRAYS, STATIC_SIGMA_T, Clip, linear_from_srgb
+from timesplat.model.io.asset import (
+    ARRAYS,
+    STATIC_SIGMA_T,
+    Clip,
+    linear_from_srgb,
+    rotation_matrices,
+)
 from timesplat.model.io.ply import write_ply
 from timesplat.model.io.usd_check import check_usd
 from timesplat.model.io.usd_read import read_usd, read_usd_with_motion
-from timesplat.model.io.usd_stage import SPLAT_TYPE
-from timesplat.model.io.usd_write import MAX_STRAY, write_usd
+from timesplat.model.io.usd_samples import MAX_STRAY
+from timesplat.model.io.usd_stage import SPLAT_TYPE, SPLATS_PATH
+from timesplat.model.io.usd_write import write_usd
 
-from ...assets import CLIP, make_asset, stray_asset
+from ...assets import CLIP, assert_same, make_asset, stray_asset, tracked_asset
 from ...usd_helpers import open_splats, run_child
 
 
@@ -38,6 +45,63 @@ def test_written_files_are_clean_and_read_back(tmp_path, suffix, options, asset)
         tolerance = {"atol": 2e-7} if exact else {"rtol": 1e-3, "atol": 1e-3}
         np.testing.assert_allclose(getattr(back, name), getattr(asset, name), err_msg=name, **tolerance)
     assert os.listdir(tmp_path) == [path.name]
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usdz"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"mode": "points"}, {"mode": "frames"}, {"half": True}, {"mode": "points", "half": True}],
+)
+@pytest.mark.parametrize("counts", [(1, 2, 5, 24), (1,), (2,)])
+def test_paths_are_clean_and_read_back(tmp_path, suffix, options, counts):
+    asset, path = tracked_asset(40, counts), tmp_path / f"a{suffix}"
+    write_usd(path, asset, **options)
+    assert check_usd(path) == []
+    back = read_usd(path)
+    assert_same(asset, back, *((1e-3, 1e-3) if options.get("half") else (1e-6, 1e-6)))
+    for name in ("start", "end", "count", "place"):
+        np.testing.assert_array_equal(getattr(back.paths, name), getattr(asset.paths, name))
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_what_rides_on_paths_is_seen_where_it_is(tmp_path, half):
+    asset = tracked_asset(40, turn=0.5)
+    write_usd(tmp_path / "a.usdc", asset, half=half)
+    _stage, prim = open_splats(tmp_path / "a.usdc")
+    turn = prim.GetAttribute("orientationsh" if half else "orientations")
+    assert prim.GetAttribute("points").GetTimeSamples() == turn.GetTimeSamples() == list(asset.clip.frames)
+    for frame in (10, 17, 33):
+        position, opacity = asset.at(asset.frame_to_time(frame))
+        np.testing.assert_allclose(np.array(prim.GetAttribute("positions").Get(frame)), position, atol=1e-6)
+        np.testing.assert_allclose(np.array(prim.GetAttribute("opacities").Get(frame)), opacity, atol=5.1e-4)
+        q = np.array([[x.GetReal(), *x.GetImaginary()] for x in turn.Get(frame)])
+        want = rotation_matrices(asset.rotation_at(asset.frame_to_time(frame)))
+        np.testing.assert_allclose(rotation_matrices(q), want, atol=3e-3 if half else 1e-6)
+    assert not prim.GetAttribute("scales").GetTimeSamples()
+
+
+def test_opacities_are_sampled_where_something_comes_or_goes(tmp_path):
+    asset = tracked_asset(9, (5, 5))
+    for end, samples in ((asset.paths.end, 24), (0 * asset.paths.end + 1, 0)):
+        paths = replace(asset.paths, start=asset.paths.start if samples else 0 * asset.paths.end - 1, end=end)
+        write_usd(tmp_path / "a.usdc", replace(asset, paths=paths))
+        _stage, prim = open_splats(tmp_path / "a.usdc")
+        assert len(prim.GetAttribute("opacities").GetTimeSamples()) == samples
+
+
+def test_a_reader_that_is_not_openusd_sees_paths(tmp_path):
+    lightusd = pytest.importorskip("lightusd")
+    asset = tracked_asset(40, turn=0.5)
+    write_usd(tmp_path / "a.usdc", asset)
+    prim = lightusd.load(str(tmp_path / "a.usdc")).prim_at(SPLATS_PATH)
+    for frame in (10, 21, 33):
+        time = asset.frame_to_time(frame)
+        xyz, q = (np.asarray(prim.attribute(n).get(time=frame)) for n in ("positions", "orientations"))
+        np.testing.assert_allclose(xyz, asset.at(time)[0], atol=1e-6)
+        agree = np.abs((q * asset.rotation_at(time)).sum(1))
+        np.testing.assert_allclose(agree, 1, atol=1e-6)
+    np.testing.assert_array_equal(np.asarray(prim.attribute("primvars:gs4d:path").get()), asset.path)
+    np.testing.assert_array_equal(np.asarray(prim.attribute("gs4d:paths:knots").get()), asset.paths.count)
 
 
 def test_the_stage_says_what_readers_need(tmp_path):
@@ -275,8 +339,8 @@ print("RESULT" + str(Usd.GetVersion()))
 
 
 @pytest.mark.parametrize("options", [{}, {"mode": "points"}], ids=["fallback", "points"])
-def test_blender_reads_it_as_a_point_cloud_that_scrubs(tmp_path, options):
-    asset = stray_asset()
+@pytest.mark.parametrize("asset", [stray_asset(), tracked_asset()], ids=["stray", "paths"])
+def test_blender_reads_it_as_a_point_cloud_that_scrubs(tmp_path, options, asset):
     write_usd(tmp_path / "a.usdc", asset, **options)
     out = json.loads(run_child(IMPORT, tmp_path / "a.usdc", 10, 17, 33))
     assert out["range"] == [10, 33]
