@@ -34,7 +34,8 @@ def knots_object(paths: Paths, name: str):
     mesh.vertices.add(len(paths.place))
     write_attributes(mesh, [("position", "FLOAT_VECTOR", paths.place), ("gs_turn", "QUATERNION", paths.rotation)])
     ob = bpy.data.objects.new(mesh.name, mesh)
-    ob.hide_viewport = ob.hide_render = ob.hide_select = True  # appending puts it into the scene's collection
+    ob.hide_viewport = ob.hide_render = ob.hide_select = True  # File > Append puts it into the scene
+    ob["timesplat"] = 1  # captures leave it out
     return ob
 
 
