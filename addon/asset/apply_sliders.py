@@ -99,7 +99,8 @@ def with_sliders(ob, frames: tuple[int, int] | None = None) -> Asset:
     Density, Crop and Lifetime Scale are exact. Time Offset and Time Scale become another clip and another rate of
     time: the asset shows at each scene frame of its clip what the object shows there. A clip has whole frames at its
     ends: where a retimed one ends between two, it ends at the frame before. What never reaches Opacity Cut is
-    left out; the rest fades out as usual, below the cut too. Point Size and Look are no part of an asset.
+    left out; the rest fades out as usual, below the cut too. Paths are retimed with what rides on them. Point Size and
+    Look are no part of an asset.
     Raises InputError where Repeat is not Hold, or nothing is left."""
     asset, s = asset_of(ob), slider_values(ob)
     if s["Repeat"] != "Hold":

@@ -21,7 +21,7 @@ from ...datagen.sequence import InputError
 from ...model.io.asset import Asset
 from ...model.io.paths import Paths
 from .attributes import read_attribute, write_attributes
-from .sliders import asset_modifier, input_property
+from .sliders import asset_modifier, get_input
 
 MAX_KNOTS = 1 << 24  # nodes count them in single precision
 
@@ -63,9 +63,9 @@ def read_paths(ob) -> dict:
         return {}
     first, at, path = np.unique(read_attribute(ob.data, "gs_path_first"), return_index=True, return_inverse=True)
     count, start, end = (read_attribute(ob.data, f"gs_path_{x}")[at] for x in ("knots", "start", "end"))
-    owner, key = input_property(asset_modifier(ob), "Paths") or ({}, '["Paths"]')
-    knots = owner.value if key == "value" else owner.get(key[2:-2])
-    if not knots or first[0] < 0 or (first + count).max() > len(knots.data.vertices):
+    knots = get_input(asset_modifier(ob), "Paths")
+    size = len(knots.data.vertices) if knots and knots.type == "MESH" else 0
+    if first[0] < 0 or (first + count).max() > size:
         raise InputError(f"{ob.name}: the paths that its Gaussians ride on are gone; import it again.")
     rows = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
     place, turn = (read_attribute(knots.data, name)[rows] for name in ("position", "gs_turn"))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from timesplat.model.io.asset import ARRAYS, STATIC_SIGMA_T, Asset, rotation_matrices
+from timesplat.model.io.files import read_asset
 
 from ..helpers import make_tracked
 from .evaluated import READ, expected_time
@@ -256,3 +257,85 @@ def test_it_plays_on_in_other_files_and_scenes(blender, start, tmp_path):
     ways = [told[k] for k in ("fresh", "twin", "other scene")] + [taken[k] for k in ("opened", "append", "link")]
     for way in ways:
         np.testing.assert_allclose(way, position[opacity >= 0.05], atol=1e-5)
+
+
+NATIVE = """
+nodes, node_trees = part("addon.asset.nodes"), part("addon.asset.node_trees")
+part("addon.asset.attributes").write_attributes(ob.data, [("rotation", "QUATERNION", asset.on_path()[1])])
+tree = sliders.asset_modifier(ob).node_group = sliders.asset_modifier(ob).node_group.copy()
+n = node_trees.Nodes(tree)
+placed, end = (next(x for x in tree.nodes if x.bl_idname == k) for k in ("GeometryNodeSetPosition", "NodeGroupOutput"))
+n.put(end.inputs[0], nodes._turn(n, placed.outputs[0], "rotation", "QUATERNION"))
+tell(**at(20.5, ob, "rotation"))
+"""
+
+
+def test_blenders_own_splats_turn_with_their_path(start):
+    asset = make_tracked()
+    got, time = start(NATIVE, asset), asset.frame_to_time(20.5)
+    seen = assert_shown(got, asset, time)
+    want = rotation_matrices(asset.rotation_at(time)[seen])
+    np.testing.assert_allclose(rotation_matrices(np.array(got["rotation"])), want, atol=1e-5)
+
+
+RENDER = """
+from pathlib import Path
+borrow, render_setup = part("datagen.scene.borrow"), part("datagen.render_setup")
+read_multilayer = part("datagen.blender_output").read_multilayer
+eye = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+scene.collection.objects.link(eye)
+eye.location, eye.rotation_euler = (1, -8, 3), (np.pi / 2, 0, 0)
+scene.camera = eye
+scene.frame_set(21, subframe=0.5)
+still = display.add_asset(applying.moment(ob, holding.asset_of(ob), 21.5), "still")
+pictures = []
+for each in (ob, still):
+    sliders.set_input(sliders.asset_modifier(each), "Look", "Splats")
+    with borrow.borrowed([each]) as stage:
+        render_setup.apply_settings(stage, render_setup.CaptureSettings((48, 48), 4, passes=False))
+        stage.camera = eye
+        stage.frame_set(21, subframe=0.5)
+        stage.render.filepath = sys.argv[1] + "/frame"
+        with bpy.context.temp_override(scene=stage):
+            bpy.ops.render.render(write_still=True)
+    pictures.append(np.array(read_multilayer(Path(sys.argv[1], "frame.exr"))["combined"]))
+tell(off=np.abs(pictures[0] - pictures[1]).mean().item(), spread=pictures[1].std().item())
+"""
+
+
+def test_a_render_shows_the_moment(start):
+    """As a comparison renders it: in a scene of its own; the same as what does not move."""
+    told = start(RENDER, make_tracked(200))
+    assert told["spread"] > 0.02 and told["off"] < 1e-3 * told["spread"], told
+
+
+OPERATORS = """
+part("addon").register()
+scene.frame_set(21, subframe=0.5)
+camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+scene.collection.objects.link(camera)
+camera.location, camera.rotation_euler = (1, -12, 3), (np.pi / 2, 0, 0)
+scene.camera = camera
+scene.render.resolution_x = scene.render.resolution_y = 100
+before = len(at(21.5, ob)["position"])
+told["done"] = [list(bpy.ops.timesplat.delete_rectangle(xmin=40, xmax=60, ymin=0, ymax=100))]
+told["gone"] = before - len(at(21.5, ob)["position"]), len(asset) - len(ob.data.attributes["gs_t"].data)
+told["done"].append(list(bpy.ops.timesplat.delete(what="FAINT", opacity=0.3)))
+scene.frame_start, scene.frame_end = 14, 16
+told["done"].append(list(bpy.ops.timesplat.export_asset(filepath=sys.argv[1] + "/frames", format="SLICES")))
+told["shown"] = [at(f, ob)["world"] for f in (14, 15, 16)]
+told["done"].append(list(bpy.ops.timesplat.bake()))
+told["baked"] = at(15, bpy.context.object)["world"]
+part("addon").unregister()
+tell(**told)
+"""
+
+
+def test_operators_take_it_like_any_other(start, tmp_path):
+    told = start(OPERATORS, make_tracked())
+    assert told["done"] == [["FINISHED"]] * 4
+    assert 0 < told["gone"][0] == told["gone"][1] < 300, "what is not there at the moment stays"
+    for frame, world in zip((14, 15, 16), told["shown"], strict=True):
+        x, y, z = read_asset(tmp_path / f"frames/frames_{frame:04d}.ply").asset.xyz[:5].T
+        np.testing.assert_allclose(np.stack([x, z, -y], 1), world, atol=1e-4)
+    np.testing.assert_allclose(told["baked"], told["shown"][1], atol=1e-4)
