@@ -12,15 +12,9 @@ import numpy as np
 
 from ...datagen.sequence import InputError
 from ...model.io.asset import Asset, Clip, check
+from .attributes import read_attribute
 from .sliders import SLIDERS, asset_modifier, get_input, is_asset
-
-
-def read_attribute(data, name: str, width: int, key: str) -> np.ndarray:
-    """An attribute as float32 (N,) or, for a width above 1, (N,width)."""
-    attribute = data.attributes[name]
-    values = np.empty(len(attribute.data) * width, np.float32)
-    attribute.data.foreach_get(key, values)
-    return values.reshape(-1, width) if width > 1 else values
+from .tracks import read_paths
 
 
 def asset_of(ob) -> Asset:
@@ -38,15 +32,16 @@ def asset_of(ob) -> Asset:
 def _asset(ob) -> Asset:
     data = ob.data
     asset = Asset(
-        xyz=read_attribute(data, "position", 3, "vector"),
-        t=read_attribute(data, "gs_t", 1, "value"),
-        velocity=read_attribute(data, "gs_velocity", 3, "vector"),
-        sigma_t=read_attribute(data, "gs_sigma_t", 1, "value"),
-        scale=read_attribute(data, "gs_scale", 3, "vector"),
-        rotation=read_attribute(data, "gs_rotation", 4, "value"),
-        rgb=_srgb(read_attribute(data, "gs_color", 4, "color")[:, :3]),
-        opacity=read_attribute(data, "gs_opacity", 1, "value"),
+        xyz=read_attribute(data, "position"),
+        t=read_attribute(data, "gs_t"),
+        velocity=read_attribute(data, "gs_velocity"),
+        sigma_t=read_attribute(data, "gs_sigma_t"),
+        scale=read_attribute(data, "gs_scale"),
+        rotation=read_attribute(data, "gs_rotation"),
+        rgb=_srgb(read_attribute(data, "gs_color")[:, :3]),
+        opacity=read_attribute(data, "gs_opacity"),
         clip=_clip(ob),
+        **read_paths(ob),
     )
     check(asset, ob.name)
     return asset

@@ -8,6 +8,7 @@ The point cloud holds the Gaussians at their own times, with the attributes
                                                    because Blender blends in linear light
     gs_order                                       a random order in 0..1, for the slider Density
     gs_radius, gs_reach, gs_row_0..2               radius of each look; rows of (R S)⁻¹ for the shader
+    those of tracks.py                             where Gaussians ride on paths
 and the modifier evaluates positions, `gs_alpha` (opacity at the moment) and radius. Looks: Points are opaque
 dots, fast; Splats are spheres of three σ whose shader computes gs_alpha · exp(-½ d²) with d the distance, in σ,
 at which the view ray passes the centre. Custom properties of the object: `timesplat` (1: it is an asset),
@@ -17,14 +18,16 @@ at which the view ray passes the centre. Custom properties of the object: `times
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import bpy
 import numpy as np
 
 from ...model.io.asset import VISIBLE, Asset, Clip, linear_from_srgb, rotation_matrices
 from . import nodes
+from .attributes import write_attributes
 from .sliders import NATIVE, set_input
+from .tracks import knots_object, track_attributes
 
 SPLAT_RADIUS = 3.0  # radius of a splat's sphere in σ
 THINNEST_SIGMA = 1e-3  # σ of the shader's splats is at least this times the largest one, for float32's sake
@@ -34,8 +37,10 @@ TRANSPARENT_BOUNCES = 1024  # how many surfaces a ray may pass; a splat is one, 
 def add_asset(asset: Asset, name: str, *, look: str = "Automatic", cut: float = VISIBLE, context=None):
     """Links a new point cloud object that plays the asset, selected and active; returns it. Its transform
     is the normalisation, so that it lies over what it was made from. `cut`: opacity below which a Gaussian
-    is left out at a moment. Needs Object Mode; raises the scene's limit of transparent bounces."""
+    is left out at a moment. Needs Object Mode; raises the scene's limit of transparent bounces. Raises InputError where
+    its paths have too many knots."""
     context = context or bpy.context
+    tracks = {"Paths": knots_object(asset.paths, name)} if asset.paths is not None else {}
     ob = point_cloud(asset.xyz, name, context)
     scale, translation = asset.clip.scale, asset.clip.translation
     ob.scale, ob.location = (scale,) * 3, translation
@@ -43,12 +48,13 @@ def add_asset(asset: Asset, name: str, *, look: str = "Automatic", cut: float = 
     ob["timesplat_clip"] = asdict(asset.clip)
     write_attributes(ob.data, attributes(asset))
     modifier = ob.modifiers.new("Timesplat", "NODES")
-    modifier.node_group = nodes.node_group(has_point_clouds())
+    modifier.node_group = nodes.node_group(has_point_clouds(), tracked=bool(tracks))
     for key, value in {
         "Look": look,
         "Opacity Cut": float(cut),
         "Frame Start": float(asset.clip.frame_start),
         "Frame End": float(asset.clip.frame_end),
+        **tracks,
     }.items():
         set_input(modifier, key, value)
     for material in (nodes.points_material(), nodes.splats_material()):
@@ -101,29 +107,26 @@ def point_cloud(xyz: np.ndarray, name: str, context):
 
 
 def attributes(asset: Asset) -> list[tuple]:
-    """(name, type, key of its values, array of N rows) of every attribute of the data but the position."""
+    """(name, kind, array of N rows) of every attribute of the data but the position."""
     soft = asset.soft_scale()  # Cycles does not blur by a share of a pixel as splat rasterisers do
     scale = np.maximum(soft, THINNEST_SIGMA * soft.max(1, keepdims=True))
-    rows = (rotation_matrices(asset.rotation) / scale[:, None, :]).transpose(0, 2, 1)  # (RS)⁻¹ = S⁻¹ Rᵀ
+    offset, rotation = (None, asset.rotation) if asset.paths is None else asset.on_path()
+    rows = (rotation_matrices(rotation) / scale[:, None, :]).transpose(0, 2, 1)  # (RS)⁻¹ = S⁻¹ Rᵀ
     color = np.concatenate([linear_from_srgb(asset.rgb), np.ones((len(asset), 1), np.float32)], 1)
     order = np.random.default_rng(0).permutation(len(asset)) / len(asset)
     found = [
-        ("gs_velocity", "FLOAT_VECTOR", "vector", asset.velocity),
-        ("gs_t", "FLOAT", "value", asset.t),
-        ("gs_sigma_t", "FLOAT", "value", asset.sigma_t),
-        ("gs_opacity", "FLOAT", "value", asset.opacity),
-        ("gs_scale", "FLOAT_VECTOR", "vector", asset.scale),
-        ("gs_rotation", "QUATERNION", "value", asset.rotation),
-        ("gs_color", "FLOAT_COLOR", "color", color),
-        ("gs_order", "FLOAT", "value", order),
-        ("gs_radius", "FLOAT", "value", np.sort(soft, 1)[:, 1]),  # covers a flat splat's face
-        ("gs_reach", "FLOAT", "value", SPLAT_RADIUS * scale.max(1)),
-        *((f"gs_row_{i}", "FLOAT_VECTOR", "vector", rows[:, i]) for i in range(3)),
+        ("gs_velocity", "FLOAT_VECTOR", asset.velocity),
+        ("gs_t", "FLOAT", asset.t),
+        ("gs_sigma_t", "FLOAT", asset.sigma_t),
+        ("gs_opacity", "FLOAT", asset.opacity),
+        ("gs_scale", "FLOAT_VECTOR", asset.scale),
+        ("gs_rotation", "QUATERNION", asset.rotation),
+        ("gs_color", "FLOAT_COLOR", color),
+        ("gs_order", "FLOAT", order),
+        ("gs_radius", "FLOAT", np.sort(soft, 1)[:, 1]),  # covers a flat splat's face
+        ("gs_reach", "FLOAT", SPLAT_RADIUS * scale.max(1)),
+        *((f"gs_row_{i}", "FLOAT_VECTOR", rows[:, i]) for i in range(3)),
     ]
-    return found + (nodes.native_attributes(asset) if NATIVE else [])
-
-
-def write_attributes(data, found: list[tuple]) -> None:
-    for name, kind, key, values in found:
-        attribute = data.attributes.new(name, kind, "POINT")
-        attribute.data.foreach_set(key, np.ascontiguousarray(values, np.float32).ravel())
+    if asset.paths is not None:
+        found += track_attributes(asset, offset)
+    return found + (nodes.native_attributes(replace(asset, rotation=rotation)) if NATIVE else [])

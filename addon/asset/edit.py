@@ -10,21 +10,9 @@ from mathutils import Matrix
 from ...datagen.sequence import InputError
 from .apply_sliders import with_sliders
 from .asset_object import slider_values
+from .attributes import KINDS, read_attribute, write_attributes
 from .display import add_asset, point_cloud
 from .sliders import asset_modifier, set_input
-
-_ATTRIBUTE_KINDS = {  # of attributes: numbers in a value, key, dtype
-    "FLOAT": (1, "value", np.float32),
-    "INT": (1, "value", np.int32),
-    "BOOLEAN": (1, "value", bool),
-    "INT8": (1, "value", np.int8),
-    "FLOAT2": (2, "vector", np.float32),
-    "FLOAT_VECTOR": (3, "vector", np.float32),
-    "FLOAT4": (4, "vector", np.float32),
-    "QUATERNION": (4, "value", np.float32),
-    "FLOAT_COLOR": (4, "color", np.float32),
-    "BYTE_COLOR": (4, "color", np.float32),
-}
 
 
 def keep_gaussians(ob, mask: np.ndarray, context=None) -> None:
@@ -39,20 +27,15 @@ def keep_gaussians(ob, mask: np.ndarray, context=None) -> None:
         raise InputError(f"{ob.name}: its data is linked from another file; make it local first.")
     kept = []
     for attribute in old.attributes:
-        if attribute.domain != "POINT" or attribute.data_type not in _ATTRIBUTE_KINDS or attribute.name.startswith("."):
+        if attribute.domain != "POINT" or attribute.data_type not in KINDS or attribute.name.startswith("."):
             continue
-        width, key, dtype = _ATTRIBUTE_KINDS[attribute.data_type]
-        values = np.empty(len(mask) * width, dtype)
-        attribute.data.foreach_get(key, values)
-        kept.append((attribute.name, attribute.data_type, key, values.reshape(len(mask), -1)[mask]))
-    xyz = next(values for name, _, _, values in kept if name == "position")
+        kept.append((attribute.name, attribute.data_type, read_attribute(old, attribute.name)[mask]))
+    xyz = next(values for name, _, values in kept if name == "position")
 
     active, selected = context.view_layer.objects.active, [o for o in context.view_layer.objects.selected if o]
     helper = point_cloud(xyz, old.name, context)  # a PointCloud cannot be resized before Blender 5.2
     new = helper.data
-    for name, kind, key, values in kept:
-        attribute = new.attributes.get(name) or new.attributes.new(name, kind, "POINT")
-        attribute.data.foreach_set(key, values.ravel())
+    write_attributes(new, kept)
     for material in old.materials:
         new.materials.append(material)
     for key, value in old.items():

@@ -10,6 +10,12 @@ All of it is saved in the .blend: it plays without this add-on, at fractional fr
     alpha = gs_opacity · exp(-½ (t - gs_t)² / (gs_sigma_t · Lifetime Scale)²)
     place = own position + gs_velocity · (t - gs_t)
 
+or where Gaussians ride on paths (see tracks.py), of which t lies at the share `part` of the way between two knots,
+
+    alpha = gs_opacity, and it is left out where t is not within gs_path_start..gs_path_end
+    turn  = the two knots' gs_turn, mixed by part and normalised       stored as gs_turn
+    place = the two knots' places, mixed by part, + gs_offset turned by it; so are gs_row_0..2 and rotation
+
 A Gaussian is left out where alpha < Opacity Cut, where gs_order >= Density (gs_order is a random order of the
 Gaussians in 0..1, so that a lower density shows a part of what a higher one does), and, with Crop, where its
 OWN position (the one at gs_t, in normalised space) is outside Crop Min..Crop Max: it is in or out for all time,
@@ -22,99 +28,45 @@ import bpy
 import numpy as np
 
 from ...model.io.asset import SH_C0
+from ...model.io.paths import WINDOW_SLACK
+from .node_trees import Nodes
 from .sliders import NATIVE, REPEATS, SLIDERS
 
 GROUP = "Timesplat 2"  # the number counts versions of the node group, so that old files keep theirs
 NATIVE_NAMES = ("3D Gaussian Splats", "GAUSSIAN_SPLAT")  # of the type: what the menu shows, its identifier
 
 
-# ---------------------------------------------------------------- writing node trees
-
-
-class Nodes:
-    """Writes node trees as expressions: every method adds a node and returns its first visible output."""
-
-    def __init__(self, tree) -> None:
-        self.tree = tree
-
-    def add(self, kind: str, *inputs, **settings):
-        """A node with its settings and its visible inputs in order (a socket, a value, None = default)."""
-        node = self.tree.nodes.new(kind)
-        for key, value in settings.items():
-            setattr(node, key, value)
-        visible = [s for s in node.inputs if s.enabled and not s.is_unavailable]
-        for socket, value in zip(visible, inputs, strict=False):
-            self.put(socket, value)
-        count = len(self.tree.nodes)
-        node.location = (190 * (count // 4), -240 * (count % 4))
-        return node
-
-    def put(self, socket, value) -> None:
-        if isinstance(value, bpy.types.NodeSocket):
-            self.tree.links.new(value, socket)
-        elif value is not None:
-            socket.default_value = value
-
-    def out(self, kind: str, *inputs, **settings):
-        return next(s for s in self.add(kind, *inputs, **settings).outputs if s.enabled)
-
-    def math(self, operation: str, *inputs):
-        return self.out("ShaderNodeMath", *inputs, operation=operation)
-
-    def vector(self, operation: str, *inputs):
-        node = self.add("ShaderNodeVectorMath", *inputs, operation=operation)
-        return node.outputs["Value" if operation == "DOT_PRODUCT" else "Vector"]
-
-    def named(self, name: str, kind: str = "FLOAT"):
-        return self.out("GeometryNodeInputNamedAttribute", name, data_type=kind)
-
-    def either(self, *truths):
-        """Whether any of them is true."""
-        any_of = truths[0]
-        for truth in truths[1:]:
-            any_of = self.out("FunctionNodeBooleanMath", any_of, truth, operation="OR")
-        return any_of
-
-    def menu(self, choice, options: dict, kind: str):
-        """The option that a menu input names."""
-        node = self.add("GeometryNodeMenuSwitch", data_type=kind)
-        for old, name in zip(node.enum_items, options, strict=False):  # renamed, not replaced: an item keeps the
-            old.name = name  # number that it was born with, and the numbers are to be indices into the options
-        for name in list(options)[len(node.enum_items) :]:
-            node.enum_items.new(name)
-        self.put(node.inputs[0], choice)
-        for name, socket in options.items():
-            self.put(node.inputs[name], socket)
-        return node.outputs[0]
-
-
 # ---------------------------------------------------------------- the group
 
 
-def node_group(clouds: bool):
-    """The shared node group: made once a file. clouds: for point clouds, else for meshes of vertices."""
-    name = GROUP + ("" if clouds else " Mesh") + (" Native" if NATIVE else "")
+def node_group(clouds: bool, tracked: bool = False):
+    """The shared node group: made once a file. clouds: for point clouds, else for meshes of vertices. tracked: for
+    Gaussians that ride on paths."""
+    name = GROUP + (" Tracked" if tracked else "") + ("" if clouds else " Mesh") + (" Native" if NATIVE else "")
     if tree := bpy.data.node_groups.get(name):
         return tree
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.is_modifier = True
-    menus = _make_interface(tree.interface)
+    menus = _make_interface(tree.interface, tracked)
     n = Nodes(tree)
     given = n.add("NodeGroupInput").outputs
     geometry = given["Geometry"] if clouds else n.out("GeometryNodeMeshToPoints", given["Geometry"])
-    n.put(n.add("NodeGroupOutput").inputs[0], _choose_look(n, given, _show_moment(n, given, geometry)))
+    shown = _ride_paths(n, given, geometry) if tracked else _follow_lines(n, given, geometry)
+    n.put(n.add("NodeGroupOutput").inputs[0], _choose_look(n, given, shown, tracked))
     for name, socket in menus.items():  # a menu has items only once it is connected
         socket.default_value = SLIDERS[name].default
     return tree
 
 
-def _make_interface(interface) -> dict:
-    """Makes the inputs and the output; returns the menus by name."""
+def _make_interface(interface, tracked: bool) -> dict:
+    """Makes the inputs and the output; returns the menus by name. On paths there is no lifetime to scale."""
     interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     panels = {"": None} | {name: interface.new_panel(name) for name in ("Time", "Crop")}
     menus = {}
     for name, slider in SLIDERS.items():
+        if tracked and name == "Lifetime Scale":
+            continue
         socket = interface.new_socket(
             name,
             in_out="INPUT",
@@ -128,11 +80,14 @@ def _make_interface(interface) -> dict:
         socket.default_value = slider.default
         if slider.lowest is not None:
             socket.min_value, socket.max_value = slider.lowest, slider.highest
+    if tracked:
+        what = "The object with the paths that the Gaussians ride on"
+        interface.new_socket("Paths", in_out="INPUT", socket_type="NodeSocketObject", description=what)
     return menus
 
 
-def _show_moment(n: Nodes, given, g):
-    """The Gaussians that are shown at the scene's frame, where they are, with their alpha."""
+def _model_time(n: Nodes, given):
+    """The time -1..1 that is shown at the scene's frame."""
     frame = n.add("GeometryNodeInputSceneTime").outputs["Frame"]
     start = given["Frame Start"]
     length = n.math("MAXIMUM", n.math("SUBTRACT", given["Frame End"], start), 0.0)
@@ -143,14 +98,12 @@ def _show_moment(n: Nodes, given, g):
     ways = (hold, loop, n.math("PINGPONG", since, length))
     inside = n.menu(given["Repeat"], dict(zip(REPEATS, ways, strict=True)), "FLOAT")
     twice = n.math("SUBTRACT", n.math("MULTIPLY", inside, 2.0), length)
-    time = n.math("DIVIDE", twice, n.math("MAXIMUM", length, 1e-6))  # 0 where the clip is one frame
+    return n.math("DIVIDE", twice, n.math("MAXIMUM", length, 1e-6))  # 0 where the clip is one frame
 
-    away = n.math("SUBTRACT", time, n.named("gs_t"))
-    lives = n.math("DIVIDE", away, n.math("MULTIPLY", n.named("gs_sigma_t"), given["Lifetime Scale"]))
-    fade = n.math("EXPONENT", n.math("MULTIPLY", n.math("MULTIPLY", lives, lives), -0.5))
-    alpha = n.math("MULTIPLY", n.named("gs_opacity"), fade)
+
+def _leave_out(n: Nodes, given, g, alpha, *unseen):
+    """Stores alpha; leaves out what the sliders say, and where any of `unseen` is true."""
     g = n.out("GeometryNodeStoreNamedAttribute", g, None, "gs_alpha", alpha, data_type="FLOAT")
-
     place = n.out("GeometryNodeInputPosition")
     above, below = n.vector("SUBTRACT", place, given["Crop Min"]), n.vector("SUBTRACT", given["Crop Max"], place)
     inner = n.add("ShaderNodeSeparateXYZ", n.vector("MINIMUM", above, below)).outputs
@@ -158,7 +111,17 @@ def _show_moment(n: Nodes, given, g):
     outside = n.out("FunctionNodeBooleanMath", given["Crop"], n.math("LESS_THAN", depth, 0.0), operation="AND")
     faint = n.math("LESS_THAN", n.named("gs_alpha"), given["Opacity Cut"])
     spare = n.math("SUBTRACT", 1.0, n.math("LESS_THAN", n.named("gs_order"), given["Density"]))
-    g = n.out("GeometryNodeDeleteGeometry", g, n.either(faint, outside, spare), domain="POINT")
+    return n.out("GeometryNodeDeleteGeometry", g, n.either(faint, outside, spare, *unseen), domain="POINT")
+
+
+def _follow_lines(n: Nodes, given, g):
+    """The Gaussians that are shown at the scene's frame, where they are, with their alpha."""
+    time = _model_time(n, given)
+    away = n.math("SUBTRACT", time, n.named("gs_t"))
+    lives = n.math("DIVIDE", away, n.math("MULTIPLY", n.named("gs_sigma_t"), given["Lifetime Scale"]))
+    fade = n.math("EXPONENT", n.math("MULTIPLY", n.math("MULTIPLY", lives, lives), -0.5))
+    alpha = n.math("MULTIPLY", n.named("gs_opacity"), fade)
+    g = _leave_out(n, given, g, alpha)
 
     away = n.math("SUBTRACT", time, n.named("gs_t"))
     step = n.add("ShaderNodeVectorMath", n.named("gs_velocity", "FLOAT_VECTOR"), operation="SCALE")
@@ -166,18 +129,59 @@ def _show_moment(n: Nodes, given, g):
     return n.out("GeometryNodeSetPosition", g, None, None, step.outputs["Vector"])
 
 
-def _choose_look(n: Nodes, given, g):
-    """The Gaussians as the slider Look has them."""
+def _ride_paths(n: Nodes, given, g):
+    """As `_follow_lines`, with gs_turn, where they ride on paths."""
+    time, start, end = _model_time(n, given), n.named("gs_path_start"), n.named("gs_path_end")
+    early = n.math("LESS_THAN", time, n.math("SUBTRACT", start, WINDOW_SLACK))
+    late = n.math("GREATER_THAN", time, n.math("ADD", end, WINDOW_SLACK))
+    g = _leave_out(n, given, g, n.named("gs_opacity"), early, late)
+
+    last = n.math("SUBTRACT", n.named("gs_path_knots", "INT"), 1.0)
+    share = n.math("DIVIDE", n.math("SUBTRACT", time, start), n.math("SUBTRACT", end, start))
+    along = n.math("MULTIPLY", n.math("MINIMUM", n.math("MAXIMUM", share, 0.0), 1.0), last)
+    whole = n.math("MINIMUM", n.math("FLOOR", along), n.math("MAXIMUM", n.math("SUBTRACT", last, 1.0), 0.0))
+    part = n.math("SUBTRACT", along, whole)
+    first, onward = n.named("gs_path_first", "INT"), n.math("MINIMUM", n.math("ADD", whole, 1.0), last)
+    pair = n.math("ADD", first, whole), n.math("ADD", first, onward)
+
+    knots = n.add("GeometryNodeObjectInfo", given["Paths"]).outputs["Geometry"]
+
+    def at_both(value, kind: str) -> list:
+        return [n.out("GeometryNodeSampleIndex", knots, value, index, data_type=kind) for index in pair]
+
+    turns = at_both(n.named("gs_turn", "QUATERNION"), "QUATERNION")
+    wxyz = (n.add("FunctionNodeRotationToQuaternion", turn).outputs for turn in turns)
+    mixed = [n.out("ShaderNodeMix", part, a, b, data_type="FLOAT") for a, b in zip(*wxyz, strict=True)]
+    turn = n.out("FunctionNodeQuaternionToRotation", *mixed)  # normalises; Mix Rotation would turn another way
+    g = n.out("GeometryNodeStoreNamedAttribute", g, None, "gs_turn", turn, data_type="QUATERNION")
+    places = at_both(n.out("GeometryNodeInputPosition"), "FLOAT_VECTOR")
+    place = n.out("ShaderNodeMix", part, *places, data_type="VECTOR")
+    offset = n.out("FunctionNodeRotateVector", n.named("gs_offset", "FLOAT_VECTOR"), n.named("gs_turn", "QUATERNION"))
+    return n.out("GeometryNodeSetPosition", g, None, n.vector("ADD", place, offset))
+
+
+def _turn(n: Nodes, g, name: str, kind: str):
+    """An attribute, FLOAT_VECTOR or QUATERNION, turned from the moving frame by gs_turn."""
+    node = "FunctionNodeRotateVector" if kind == "FLOAT_VECTOR" else "FunctionNodeRotateRotation"
+    turned = n.out(node, n.named(name, kind), n.named("gs_turn", "QUATERNION"))
+    return n.out("GeometryNodeStoreNamedAttribute", g, None, name, turned, data_type=kind)
+
+
+def _choose_look(n: Nodes, given, g, tracked: bool):
+    """The Gaussians as the slider Look has them. What only some looks need is not evaluated for the others."""
     size = n.math("MULTIPLY", n.named("gs_radius"), given["Point Size"])
     points = n.out("GeometryNodeSetPointRadius", g, None, size)
     points = n.out("GeometryNodeSetMaterial", points, None, points_material())
-    splats = n.out("GeometryNodeSetPointRadius", g, None, n.named("gs_reach"))
+    splats = g
+    for name in ("gs_row_0", "gs_row_1", "gs_row_2") if tracked else ():
+        splats = _turn(n, splats, name, "FLOAT_VECTOR")
+    splats = n.out("GeometryNodeSetPointRadius", splats, None, n.named("gs_reach"))
     splats = n.out("GeometryNodeSetMaterial", splats, None, splats_material())
     viewport = n.add("GeometryNodeIsViewport").outputs[0]
     automatic = n.out("GeometryNodeSwitch", viewport, splats, points, input_type="GEOMETRY")
     options = {"Automatic": automatic, "Points": points, "Splats": splats}
     if NATIVE:
-        options["Native"] = native_splats(n, g)
+        options["Native"] = native_splats(n, _turn(n, g, "rotation", "QUATERNION") if tracked else g)
     return n.menu(given["Look"], options, "GEOMETRY")
 
 
@@ -201,13 +205,13 @@ def native_splats(n: Nodes, g):
 
 
 def native_attributes(asset) -> list[tuple]:
-    """What `native_splats` needs in the data, beside the rest: (name, type, key, values) each."""
+    """What `native_splats` needs in the data, beside the rest: (name, kind, values) each."""
     base = (asset.rgb - 0.5) / SH_C0
     alpha = asset.opacity[:, None]
     return [
-        ("scale", "FLOAT_VECTOR", "vector", asset.soft_scale()),
-        ("rotation", "QUATERNION", "value", asset.rotation),
-        ("radiance:base", "FLOAT4", "vector", np.concatenate([base, alpha], 1)),
+        ("scale", "FLOAT_VECTOR", asset.soft_scale()),
+        ("rotation", "QUATERNION", asset.rotation),
+        ("radiance:base", "FLOAT4", np.concatenate([base, alpha], 1)),
     ]
 
 

@@ -84,13 +84,13 @@ def set_input(modifier, name: str, value) -> None:
 
 
 def get_input(modifier, name: str):
-    """The input's value: a number, a bool, a tuple of three, or the name of a menu's item; the default where an
-    older node group lacks the input."""
-    found = input_property(modifier, name)
+    """The input's value: a number, a bool, a tuple of three, the name of a menu's item, or of Paths (tracks.py) an
+    object or None; the default where the node group lacks the input."""
+    slider, found = SLIDERS.get(name), input_property(modifier, name)
     if found is None:
-        return SLIDERS[name].default
+        return slider and slider.default
     owner, key = found
-    value = owner.value if key == "value" else owner[key[2:-2]]
+    value = owner.value if key == "value" else owner.get(key[2:-2])
     if name in MENUS:
         return value if isinstance(value, str) else MENUS[name][value]
-    return tuple(value) if SLIDERS[name].socket == "Vector" else value
+    return tuple(value) if slider and slider.socket == "Vector" else value

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from timesplat.model.io.asset import Asset, Clip
+from timesplat.model.io.asset import STATIC_SIGMA_T, Asset, Clip
+from timesplat.model.io.paths import Paths, multiply, rotate
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TARGET = os.environ.get("TIMESPLAT_BLENDER") or sys.executable
@@ -105,3 +106,32 @@ def make(n=300, seed=0, clip=CLIP) -> Asset:
         "opacity": r.uniform(0.1, 0.99, n),
     }
     return Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=clip)
+
+
+def make_tracked(n=300, seed=0, clip=CLIP) -> Asset:
+    """A random asset of `n` Gaussians on 20 paths of 1 to 6 knots; most of these are there for a part of the clip, from
+    one whole frame to another, and turn by up to a third of a round from knot to knot."""
+    r = np.random.default_rng(seed)
+    p = 20
+    count = r.integers(1, 7, p)
+    count[0] = 1
+    last = clip.frame_end - clip.frame_start
+    start, end = np.sort(r.permuted(np.tile(np.arange(last + 1), (p, 1)), axis=1)[:, :2] / last * 2 - 1, axis=1).T
+    start[:4], end[:4] = -1, 1
+    step = np.concatenate([np.ones((count.sum(), 1)), r.uniform(-0.4, 0.4, (count.sum(), 3))], 1)
+    step /= np.linalg.norm(step, axis=1, keepdims=True)
+    for i in np.setdiff1d(np.arange(count.sum()), np.cumsum(count) - count):
+        step[i] = multiply(step[i], step[i - 1])
+        step[i] *= np.sign(step[i] @ step[i - 1])
+    place = r.uniform(-0.8, 0.8, (count.sum(), 3))
+    single = (x.astype(np.float32) for x in (start, end))
+    paths = Paths(*single, count.astype(np.int32), place.astype(np.float32), step.astype(np.float32))
+
+    path = (r.permutation(n) % p).astype(np.int32)
+    t = r.uniform(start[path], end[path]).astype(np.float32)
+    at, turn = paths.at(t, path)
+    rides = {"xyz": at + rotate(turn, r.normal(0, 0.1, (n, 3)).astype(np.float32)), "t": t}
+    rides |= {"velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
+    looks = {k: getattr(make(n, seed), k) for k in ("scale", "rotation", "rgb", "opacity")}
+    arrays = {k: a.astype(np.float32) for k, a in (rides | looks).items()}
+    return Asset(**arrays, clip=clip, path=path, paths=paths)

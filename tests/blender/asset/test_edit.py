@@ -17,7 +17,7 @@ from .evaluated import expected_time
 START = """
 part("addon").register()
 display, sliders, edit = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit"))
-holding, applying = part("addon.asset.asset_object"), part("addon.asset.apply_sliders")
+holding, applying, attributes = (part(f"addon.asset.{x}") for x in ("asset_object", "apply_sliders", "attributes"))
 asset_module = part("model.io.asset")
 bpy.ops.wm.read_factory_settings(use_empty=True)
 asset, scene = part("model.io.ply").read_ply(sys.argv[1]), bpy.context.scene
@@ -125,7 +125,7 @@ def test_applied_sliders_show_the_same(start, tmp_path):
     for i, case in enumerate(cases):
         set_all({**base, **case})
         clips.append(save(applying.with_sliders(ob), f"{out}/{i}.npz"))
-    order = holding.read_attribute(ob.data, "gs_order", 1, "value").tolist()
+    order = attributes.read_attribute(ob.data, "gs_order").tolist()
     shown = {}
     for frame in (10.0, 17.5):
         set_all({**base, **cases[5]})
@@ -297,7 +297,7 @@ told["name"], told["hidden"] = new.name, [ob.hide_get(), ob.hide_render, new.hid
 told["sliders"] = {n: sliders.get_input(sliders.asset_modifier(new), n) for n in sliders.SLIDERS}
 told["clip"] = save(holding.asset_of(new), sys.argv[2] + "/new.npz")
 told["source"] = list(new["timesplat_source"])
-told["order"] = holding.read_attribute(ob.data, "gs_order", 1, "value").tolist()
+told["order"] = attributes.read_attribute(ob.data, "gs_order").tolist()
 bpy.context.view_layer.objects.active = ob
 told["empty"] = refused(bpy.ops.timesplat.bake, frame_start=5, frame_end=4)
 bpy.ops.timesplat.bake(frame_start=100, frame_end=120)
