@@ -63,10 +63,10 @@ LAYERS = {
         ("addon",),
     ),
     "datagen": (
-        ("datagen.image_files", "datagen.rigs", "datagen.track_file"),
+        ("datagen.image_files", "datagen.rigs", "datagen.track_file", "datagen.outside"),
         ("datagen.sequence",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
-        ("datagen.render_setup",),
+        ("datagen.render_setup", "datagen.tracks"),
         ("datagen.capture",),
         ("datagen.render_asset", "datagen.farm"),
     ),
