@@ -63,7 +63,8 @@ LAYERS = {
         ("addon",),
     ),
     "datagen": (
-        ("datagen.image_files", "datagen.rigs", "datagen.track_file", "datagen.outside"),
+        ("datagen.image_files", "datagen.rigs", "datagen.track_file"),
+        ("datagen.outside", "datagen.spread", "datagen.moving_frames"),
         ("datagen.sequence",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.render_setup", "datagen.tracks"),
