@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-_AXES = 13  # each looked along both ways: 26 directions
-_GRID = 160  # cells a side, at most
-_TOLERANCE = 2.0  # cells: how far behind the foremost of its cell a point of the same, slanted surface may lie
+_AXES = 26  # each looked along both ways: 52 directions
+_GRID = 256  # cells a side, at most
+_SPACINGS = 2.5  # a cell is so many spacings of points wide, at least: an empty one in front shows what is behind
+# Cells: how far behind the foremost of its cell a point of the same surface, faced nearly straight, may lie.
+_TOLERANCE = 0.5
 
 
 def seen_from_outside(points: np.ndarray, spacing: float) -> np.ndarray:
@@ -18,7 +20,7 @@ def seen_from_outside(points: np.ndarray, spacing: float) -> np.ndarray:
         return seen
     low, high = points.min(0), points.max(0)
     half = float(np.linalg.norm(high - low) / 2) + 1e-9
-    cell = max(2 * half / _GRID, 2 * spacing)  # an empty cell in front would show what is behind
+    cell = max(2 * half / _GRID, _SPACINGS * spacing)
     side = int(2 * half / cell) + 2
     centred = (points - (low + high) / 2).astype(np.float32)
     for right, up, forward in _looks():

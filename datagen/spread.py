@@ -7,6 +7,8 @@ from __future__ import annotations
 import numpy as np
 
 _SHRINK = 0.85  # of the distance kept, from round to round
+_LEAST = 0.1  # of the first distance: closer points lie on something that is crumpled at this moment
+_CROWD = 64  # points in a row of three cells that are looked at: nowhere are so many but where it is crumpled
 _SAME_SIDE = -0.3  # cosine of normals: beyond it two points lie on the two faces of something thin
 
 
@@ -19,7 +21,7 @@ def spread(
     that must keep it, a large one at first, then smaller ones while some are missing. Normals of 0 have no sides."""
     if count >= len(points):
         return np.arange(len(points))
-    radius = np.sqrt(area / count)  # of a square patch for each: more than any pattern of points could keep
+    radius = first = np.sqrt(area / count)  # of a square patch for each: hardly a pattern of points could keep it
     chosen, priority = np.zeros(len(points), bool), rng.permutation(len(points))
     while True:
         open_ = np.flatnonzero(~chosen)
@@ -29,6 +31,8 @@ def spread(
         both = ~(blocked | chosen)[a] & ~(blocked | chosen)[b]
         added = _first_come(open_[~blocked[open_]], a[both], b[both], priority)
         missing = count - int(chosen.sum())
+        if radius < _LEAST * first:
+            added = open_
         if len(added) >= missing:
             chosen[added[np.argsort(priority[added])[:missing]]] = True
             return np.flatnonzero(chosen)
@@ -69,7 +73,7 @@ def _close_pairs(
     for row in (0, z, (y - 1) * z, y * z, (y + 1) * z):  # cells one after the other along z; half of the neighbours
         end = np.searchsorted(number, number + row + 1, "right")
         start = np.searchsorted(number, number + row - 1, "left") if row else np.arange(1, len(number) + 1)
-        length = end - start
+        length = np.minimum(end - start, _CROWD)
         i = np.repeat(np.arange(len(number)), length)
         j = np.arange(len(i)) + np.repeat(start - np.cumsum(length) + length, length)
         near = ((points[i] - points[j]) ** 2).sum(1) < radius * radius

@@ -17,7 +17,7 @@ from .spread import spread
 from .track_file import SurfaceTracks
 
 FEWEST, MOST = 4_000, 100_000  # points where their number is chosen here
-_FEWEST_CANDIDATES, _MOST_CANDIDATES = 40_000, 1_600_000
+_FEWEST_CANDIDATES, _MOST_CANDIDATES = 80_000, 1_600_000  # what is hidden is told by how densely they lie
 _CANDIDATES = 4  # for each point wanted
 _LOOKS = 4  # frames of the clip that areas and what is seen are judged by
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])  # Roberts' sequence: its first points fill a square evenly
@@ -87,7 +87,9 @@ def _choose(
         if seen.sum() >= 2 * wanted or candidates == _MOST_CANDIDATES:
             break
         candidates = int(min(candidates * 2 * _CANDIDATES * wanted / seen.sum(), _MOST_CANDIDATES))
-    points = points[seen]
+    some = np.flatnonzero(seen)
+    some = some[np.linspace(0, len(some), min(_CANDIDATES * wanted, len(some)), endpoint=False).astype(int)]
+    points = points[some]
     at, normals = _laid_out(surfaces, points)
     chosen = spread(at, normals, points.surface, visible, wanted, rng)
     return points[chosen], visible / len(chosen)
@@ -99,16 +101,16 @@ def _frames_of(surface: Surface) -> np.ndarray:
 
 def _areas(surface: Surface, pixel: float) -> np.ndarray:
     """(T,) float64: a triangle's mean area over some frames; a strand's segment is at least a pixel wide."""
-    total = np.zeros(len(surface.corners))
     frames = _frames_of(surface)
-    for frame in frames:
-        a, b, c = (surface.at(frame)[surface.corners[:, i]].astype(np.float64) for i in range(3))
-        if surface.radius is None:
-            total += np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-        else:
-            width = 2 * np.pi * surface.radius[surface.corners[:, :2]].mean(1)
-            total += np.linalg.norm(b - a, axis=1) * np.maximum(width, pixel)
-    return total / len(frames)
+    return sum(_triangle_areas(surface, frame, pixel) for frame in frames) / len(frames)
+
+
+def _triangle_areas(surface: Surface, frame: int, pixel: float) -> np.ndarray:
+    a, b, c = (surface.at(frame)[surface.corners[:, i]].astype(np.float64) for i in range(3))
+    if surface.radius is None:
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    width = 2 * np.pi * surface.radius[surface.corners[:, :2]].mean(1)
+    return np.linalg.norm(b - a, axis=1) * np.maximum(width, pixel)
 
 
 def _drawn(areas: list[np.ndarray], count: int, rng: np.random.Generator) -> _Points:
@@ -144,11 +146,12 @@ def _seen(surfaces: list[Surface], points: _Points, looks: list[int], spacing: f
 
 
 def _laid_out(surfaces: list[Surface], points: _Points) -> tuple[np.ndarray, np.ndarray]:
-    """(M,3) float32 each: where the points and their normals are in the middle of their surface's time."""
+    """(M,3) float32 each: where the points and their normals are when their surface is largest."""
     at, normals = np.empty((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
     for s, part in points.by_surface():
         surface, own = surfaces[s], points[part]
-        vertices = surface.at((surface.first + surface.last) // 2)
+        sizes = [(_triangle_areas(surface, frame, 0).sum(), frame) for frame in _frames_of(surface)]
+        vertices = surface.at(max(sizes)[1])
         at[part] = _positions(vertices, surface, own)
         if surface.radius is None:
             frame, there = triangle_frames(vertices[surface.corners[own.triangle]])

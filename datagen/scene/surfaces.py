@@ -207,11 +207,11 @@ def _triangles(mesh) -> np.ndarray:
 
 def _strands(curves) -> _Shape:
     starts, counts = _values(curves.curves, "first_point_index"), _values(curves.curves, "points_length")
-    points = _attribute(curves, "position", "vector")
+    points = _attribute(curves, "position", "vector").reshape(-1, 3)
     begin = np.ones(len(points), bool)
     begin[np.cumsum(counts) - 1] = False  # a strand's last point begins no segment
     a = np.flatnonzero(begin).astype(np.int32)
-    return _Shape(points.reshape(-1, 3), (starts, counts), np.stack([a, a + 1, a + 1], 1), _radius(curves, 0.005))
+    return _Shape(points, (starts, counts), np.stack([a, a + 1, a + 1], 1), _radius(curves, 0.005))
 
 
 def _balls(cloud) -> _Shape:
