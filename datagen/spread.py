@@ -4,11 +4,14 @@ only."""
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 _SHRINK = 0.85  # of the distance kept, from round to round
 _LEAST = 0.1  # of the first distance: closer points lie on something that is crumpled at this moment
 _CROWD = 64  # points in a row of three cells that are looked at: nowhere are so many but where it is crumpled
+_AT_ONCE = 50_000  # points whose neighbours are looked at together
 _SAME_SIDE = -0.3  # cosine of normals: beyond it two points lie on the two faces of something thin
 
 
@@ -70,11 +73,13 @@ def _close_pairs(
     order = np.argsort(number, kind="stable")
     number, points, normals, group = number[order], points[order], normals[order], group[order]
     pairs = []
-    for row in (0, z, (y - 1) * z, y * z, (y + 1) * z):  # cells one after the other along z; half of the neighbours
-        end = np.searchsorted(number, number + row + 1, "right")
-        start = np.searchsorted(number, number + row - 1, "left") if row else np.arange(1, len(number) + 1)
-        length = np.minimum(end - start, _CROWD)
-        i = np.repeat(np.arange(len(number)), length)
+    for row, begin in product((0, z, (y - 1) * z, y * z, (y + 1) * z), range(0, len(number), _AT_ONCE)):
+        # Cells follow one another along z: three at once, in half of the rows around, and what comes after in its own.
+        own = number[begin : begin + _AT_ONCE]
+        here = np.arange(begin, begin + len(own))
+        start = np.searchsorted(number, own + row - 1, "left") if row else here + 1
+        length = np.minimum(np.searchsorted(number, own + row + 1, "right") - start, _CROWD)
+        i = np.repeat(here, length)
         j = np.arange(len(i)) + np.repeat(start - np.cumsum(length) + length, length)
         near = ((points[i] - points[j]) ** 2).sum(1) < radius * radius
         i, j = i[near], j[near]
