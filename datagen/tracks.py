@@ -73,7 +73,11 @@ def _choose(
     surfaces: list[Surface], looks: list[int], pixel: float, count: int, rng: np.random.Generator
 ) -> tuple[_Points, float]:
     """The points that are followed, and the area that each stands for."""
-    areas = [_areas(s, pixel) for s in surfaces]
+    areas, largest = [], []
+    for surface in surfaces:
+        mean, frame = _areas(surface, pixel)
+        areas.append(mean)
+        largest.append(frame)
     total = float(sum(a.sum() for a in areas))
     if not total > 0:
         return _Points(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32)), 0.0
@@ -86,31 +90,29 @@ def _choose(
         wanted = count or int(np.clip(visible / patch, FEWEST, MOST))
         if seen.sum() >= 2 * wanted or candidates == _MOST_CANDIDATES:
             break
-        candidates = int(min(candidates * 2 * _CANDIDATES * wanted / seen.sum(), _MOST_CANDIDATES))
+        candidates = int(min(candidates * 2 * _CANDIDATES * wanted / max(seen.sum(), 1), _MOST_CANDIDATES))
     some = np.flatnonzero(seen)
     some = some[np.linspace(0, len(some), min(_CANDIDATES * wanted, len(some)), endpoint=False).astype(int)]
     points = points[some]
-    at, normals = _laid_out(surfaces, points)
+    at, normals = _laid_out(surfaces, largest, points)
     chosen = spread(at, normals, points.surface, visible, wanted, rng)
     return points[chosen], visible / len(chosen)
 
 
-def _frames_of(surface: Surface) -> np.ndarray:
-    return np.unique(np.linspace(surface.first, surface.last, _LOOKS).round().astype(int))
-
-
-def _areas(surface: Surface, pixel: float) -> np.ndarray:
-    """(T,) float64: a triangle's mean area over some frames; a strand's segment is at least a pixel wide."""
-    frames = _frames_of(surface)
-    return sum(_triangle_areas(surface, frame, pixel) for frame in frames) / len(frames)
-
-
-def _triangle_areas(surface: Surface, frame: int, pixel: float) -> np.ndarray:
-    a, b, c = (surface.at(frame)[surface.corners[:, i]].astype(np.float64) for i in range(3))
-    if surface.radius is None:
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    width = 2 * np.pi * surface.radius[surface.corners[:, :2]].mean(1)
-    return np.linalg.norm(b - a, axis=1) * np.maximum(width, pixel)
+def _areas(surface: Surface, pixel: float) -> tuple[np.ndarray, int]:
+    """(T,) float64: a triangle's mean area over some frames, where a strand's segment is at least a pixel wide; and the
+    one of these frames at which all of them are largest."""
+    frames = np.unique(np.linspace(surface.first, surface.last, _LOOKS).round().astype(int))
+    areas = np.empty((len(frames), len(surface.corners)))
+    for i, frame in enumerate(frames):
+        vertices = surface.at(frame).astype(np.float64)
+        a, b, c = (vertices[surface.corners[:, k]] for k in range(3))
+        if surface.radius is None:
+            areas[i] = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        else:
+            width = 2 * np.pi * surface.radius[surface.corners[:, :2]].mean(1)
+            areas[i] = np.linalg.norm(b - a, axis=1) * np.maximum(width, pixel)
+    return areas.mean(0), int(frames[areas.sum(1).argmax()])
 
 
 def _drawn(areas: list[np.ndarray], count: int, rng: np.random.Generator) -> _Points:
@@ -145,17 +147,16 @@ def _seen(surfaces: list[Surface], points: _Points, looks: list[int], spacing: f
     return seen
 
 
-def _laid_out(surfaces: list[Surface], points: _Points) -> tuple[np.ndarray, np.ndarray]:
-    """(M,3) float32 each: where the points and their normals are when their surface is largest."""
+def _laid_out(surfaces: list[Surface], frames: list[int], points: _Points) -> tuple[np.ndarray, np.ndarray]:
+    """(M,3) float32 each: where the points and their normals are at the frame of each surface."""
     at, normals = np.empty((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
     for s, part in points.by_surface():
         surface, own = surfaces[s], points[part]
-        sizes = [(_triangle_areas(surface, frame, 0).sum(), frame) for frame in _frames_of(surface)]
-        vertices = surface.at(max(sizes)[1])
+        vertices = surface.at(frames[s])
         at[part] = _positions(vertices, surface, own)
         if surface.radius is None:
-            frame, there = triangle_frames(vertices[surface.corners[own.triangle]])
-            normals[part] = np.where(there[:, None], frame[..., 2], 0)
+            turn, there = triangle_frames(vertices[surface.corners[own.triangle]])
+            normals[part] = np.where(there[:, None], turn[..., 2], 0)
     return at, normals
 
 

@@ -352,6 +352,18 @@ def test_an_object_of_no_size_for_a_while_keeps_its_frame():
     assert np.abs(at[:, [0, 1, 3]]).max() < 1e-6 and np.abs(at[:, 2]).max() > 0.49
 
 
+def test_what_has_no_faces_is_neither_followed_nor_named():
+    cube("solid", size=1)
+    wire = bpy.data.meshes.new("wire")
+    wire.from_pydata([(0, 0, 0), (3, 0, 0)], [(0, 1)], [])
+    empty = (bpy.data.meshes.new("empty"), bpy.data.hair_curves.new("bald"), bpy.data.curves.new("line", "CURVE"))
+    for data in (wire, *empty, bpy.data.pointclouds.new("none")):
+        bpy.context.collection.objects.link(bpy.data.objects.new(data.name, data))
+    bpy.ops.object.light_add(type="SUN")
+    tracks, untracked = track([1, 2], 100)
+    assert untracked == [] and np.abs(tracks.position * 1.7 + NORM.translation).max() < 0.51
+
+
 def building_up(ob):
     m = ob.modifiers.new("m", "BUILD")
     m.frame_start, m.frame_duration = 1, 10
