@@ -6,22 +6,27 @@ import math
 import bpy
 import numpy as np
 import pytest
-from mathutils import Vector
-from mathutils.bvhtree import BVHTree
 
 from timesplat.datagen import rigs
 from timesplat.datagen.capture import Subject, capture
 from timesplat.datagen.render_setup import CaptureSettings
 from timesplat.datagen.scene.open import empty_session, open_asset
 from timesplat.datagen.scene.simulate import simulate
-from timesplat.datagen.sequence import InputError, Normalisation
+from timesplat.datagen.sequence import InputError
 from timesplat.datagen.tracks import track_surfaces
 
 from .helpers import cube, key
-
-NORM = Normalisation(1.7, (0.2, -0.1, 0.3))
-FRAMES = [1, 2.25, 3, 4.5]
-PIXEL = 0.02
+from .track_helpers import (
+    FRAMES,
+    NORM,
+    PIXEL,
+    assert_rides,
+    bent_by_bones,
+    building_up,
+    geometry_nodes,
+    matrices,
+    track,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -29,91 +34,7 @@ def nothing():
     empty_session()
 
 
-def track(frames=FRAMES, count=300, **options):
-    return track_surfaces(frames, NORM, PIXEL, count, **options)
-
-
-def read_by_hand(frame, names=None):
-    """World vertices (V,3) and triangles (T,3) of all meshes that the scene shows, joined."""
-    whole = math.floor(frame)
-    bpy.context.scene.frame_set(whole, subframe=frame - whole)
-    vertices, triangles, count = [], [], 0
-    for instance in bpy.context.evaluated_depsgraph_get().object_instances:
-        ob = instance.object
-        if ob.type != "MESH" or not instance.show_self or (names and ob.name not in names):
-            continue
-        matrix = instance.matrix_world.copy()
-        vertices += [matrix @ v.co for v in ob.data.vertices]
-        triangles += [[count + i for i in t.vertices] for t in ob.data.loop_triangles]
-        count = len(vertices)
-    return np.array(vertices), np.array(triangles)
-
-
-def weights_in(triangle, point):
-    """(3,) barycentric coordinates of a point in a triangle (3,3)."""
-    return np.linalg.lstsq(np.vstack([triangle.T, np.ones(3)]), np.append(point, 1), rcond=None)[0]
-
-
-def matrices(q):
-    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
-    rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]]
-    rows += [[2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]]
-    rows += [[2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-
-
-def assert_rides(tracks, frames, names=None, at_least=300):
-    """Each point stays at one place of one triangle of the meshes, and z of its frame is this triangle's normal."""
-    assert len(tracks) >= at_least
-    world = tracks.position.astype(float) * NORM.scale + NORM.translation
-    shapes = [read_by_hand(frame, names) for frame in frames]
-    triangles = shapes[0][1]
-    tree = BVHTree.FromPolygons([Vector(v) for v in shapes[0][0]], triangles.tolist())
-    z = matrices(tracks.rotation)[..., 2]
-    assert np.allclose(np.linalg.norm(tracks.rotation.astype(float), axis=-1), 1, atol=2e-3)
-    assert ((tracks.rotation[:, 1:].astype(float) * tracks.rotation[:, :-1]).sum(-1) >= 0).all()
-    facing = []
-    for point, normal in zip(world, z, strict=True):
-        _, _, index, distance = tree.find_nearest(Vector(point[0]))
-        assert distance < 1e-4
-        corner = triangles[index]
-        w = weights_in(shapes[0][0][corner], point[0])
-        moved = np.array([w @ vertices[corner] for vertices, _ in shapes])
-        assert np.abs(moved - point).max() < 2e-4
-        a, b, c = np.stack([vertices[corner] for vertices, _ in shapes], 1)
-        n = np.cross(b - a, c - a)
-        n /= np.linalg.norm(n, axis=1, keepdims=True)
-        facing.append((n * normal).sum(1))
-    assert (np.array(facing) > 0.999).all(1).mean() > 0.97  # but for points on an edge, that found its other triangle
-
-
 # ---------------------------------------------------------------- what moves
-
-
-def bent_by_bones():
-    bpy.ops.mesh.primitive_cylinder_add(vertices=12, radius=0.3, depth=2)
-    ob = bpy.context.object
-    bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.mesh.subdivide(number_cuts=3)
-    bpy.ops.object.mode_set(mode="OBJECT")
-    bpy.ops.object.armature_add(location=(0, 0, -1))
-    rig = bpy.context.object
-    bpy.ops.object.mode_set(mode="EDIT")
-    bones = rig.data.edit_bones
-    bones[0].tail = (0, 0, 1)
-    tip = bones.new("tip")
-    tip.head, tip.tail, tip.parent = (0, 0, 1), (0, 0, 2), bones[0]
-    bpy.ops.object.mode_set(mode="OBJECT")
-    for name, part in (("Bone", lambda z: max(0, 0.5 - z)), ("tip", lambda z: max(0, 0.5 + z))):
-        group = ob.vertex_groups.new(name=name)
-        for v in ob.data.vertices:
-            group.add([v.index], part(v.co.z), "REPLACE")
-    ob.modifiers.new("skin", "ARMATURE").object = rig
-    bone = rig.pose.bones["tip"]
-    bone.rotation_mode = "XYZ"
-    key(bone, "rotation_euler", {1: (0, 0, 0), 5: (1.2, 0.4, 0)})
-    key(rig, "location", {1: (0, 0, -1), 5: (0.5, 0, -1)})
-    return ob
 
 
 def shape_keys():
@@ -160,20 +81,6 @@ def two_of_a_collection():
         empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", inner, (0, i, 0)
         bpy.context.collection.objects.link(empty)
         key(empty, "rotation_euler", {1: (0, 0, 0), 5: (0, 1 + i, 0)})
-
-
-def geometry_nodes(ob, build):
-    """A modifier of nodes that `build(nodes, connect)` adds, from "in" to "out"."""
-    group = bpy.data.node_groups.new("nodes", "GeometryNodeTree")
-    for way in ("INPUT", "OUTPUT"):
-        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    nodes = {"in": group.nodes.new("NodeGroupInput"), "out": group.nodes.new("NodeGroupOutput")}
-
-    def add(kind):
-        return group.nodes.new(kind)
-
-    build(add, group.links.new, nodes["in"].outputs[0], nodes["out"].inputs[0])
-    ob.modifiers.new("nodes", "NODES").node_group = group
 
 
 def scattered():
@@ -298,156 +205,6 @@ def test_a_point_cloud():
     world = tracks.position[:, 0] * 1.7 + NORM.translation
     corner = np.linalg.norm(world[:, None] - [v.co for v in ob.data.vertices], axis=-1)
     assert (corner.min(1) < 0.1001).all() and np.bincount(corner.argmin(1)).min() >= 10
-
-
-# ---------------------------------------------------------------- what is there, and when
-
-
-def test_renders_decide_what_is_shown():
-    """A modifier for renders alone counts, one for the viewport alone does not, and what is hidden has no points."""
-    ob = cube(size=1)
-    for name, render in (("render", True), ("viewport", False)):
-        m = ob.modifiers.new(name, "DISPLACE")
-        m.mid_level, m.strength = 0, 0.5 if render else 5
-        m.show_render, m.show_viewport = render, not render
-    hidden = cube("hidden", (0, 0, 3))
-    hidden.hide_render = True
-    tracks, _ = track([1], 100)
-    radius = np.linalg.norm(tracks.position[:, 0] * 1.7 + NORM.translation, axis=1)
-    corner = np.linalg.norm([0.5] * 3) + 0.5
-    assert corner / np.sqrt(3) - 1e-3 < radius.min() and radius.max() < corner
-
-
-def test_a_window():
-    key(cube("here", size=0.5), "location", {1: (0, 0, 0), 6: (1, 0, 0)})
-    late = cube("late", (0, 3, 0), 0.5)
-    for frame, hide in ((1, True), (3, False), (4, True), (5, False)):
-        late.hide_render = hide
-        late.keyframe_insert("hide_render", frame=frame)
-    key(late, "location", {1: (0, 3, 0), 6: (0, 4, 0)})
-    tracks, untracked = track([1, 2, 3, 4, 5, 6, 6], 400)
-    assert untracked == []
-    windows = {tuple(w) for w in zip(tracks.first.tolist(), tracks.last.tolist(), strict=True)}
-    assert windows == {(0, 6), (2, 2), (4, 6)}
-    blink = tracks.first == 2
-    assert (tracks.position[blink] == tracks.position[blink][:, :1]).all() and blink.sum() > 50
-    after = tracks.first == 4
-    assert (tracks.position[after][:, :4] == tracks.position[after][:, 4:5]).all()
-    assert (tracks.position[after][:, 5] == tracks.position[after][:, 6]).all()  # a padded frame
-    moved = []
-    for frame in (5, 6):
-        bpy.context.scene.frame_set(frame)
-        moved.append(np.array(late.location) / 1.7)
-    step = tracks.position[after][:, 5] - tracks.position[after][:, 4]
-    assert moved[0][1] < moved[1][1] and np.allclose(step, moved[1] - moved[0], atol=1e-5)
-
-
-def test_an_object_of_no_size_for_a_while_keeps_its_frame():
-    ob = cube(size=1)
-    key(ob, "scale", {1: (0, 0, 0), 2: (0, 0, 0), 3: (1, 1, 1), 4: (0, 0, 0)})
-    tracks, _ = track([1, 2, 3, 4], 60)
-    q = tracks.rotation.astype(float)
-    assert np.abs(q - q[:, 2:3]).max() == 0
-    at = tracks.position * 1.7 + np.array(NORM.translation)
-    assert np.abs(at[:, [0, 1, 3]]).max() < 1e-6 and np.abs(at[:, 2]).max() > 0.49
-
-
-def test_what_has_no_faces_is_neither_followed_nor_named():
-    cube("solid", size=1)
-    wire = bpy.data.meshes.new("wire")
-    wire.from_pydata([(0, 0, 0), (3, 0, 0)], [(0, 1)], [])
-    empty = (bpy.data.meshes.new("empty"), bpy.data.hair_curves.new("bald"), bpy.data.curves.new("line", "CURVE"))
-    for data in (wire, *empty, bpy.data.pointclouds.new("none")):
-        bpy.context.collection.objects.link(bpy.data.objects.new(data.name, data))
-    bpy.ops.object.light_add(type="SUN")
-    tracks, untracked = track([1, 2], 100)
-    assert untracked == [] and np.abs(tracks.position * 1.7 + NORM.translation).max() < 0.51
-
-
-def building_up(ob):
-    m = ob.modifiers.new("m", "BUILD")
-    m.frame_start, m.frame_duration = 1, 10
-
-
-def thinning_out(ob):
-    bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.mesh.subdivide(number_cuts=4)
-    bpy.ops.object.mode_set(mode="OBJECT")
-    key(ob.modifiers.new("m", "DECIMATE"), "ratio", {1: 1.0, 5: 0.3})
-
-
-def cut_out(ob):
-    other = cube("cutter", (0.5, 0.5, 0.5), 0.6)
-    other.hide_render = other.hide_viewport = True
-    key(other, "location", {1: (0.5, 0.5, 0.5), 5: (0, 0, 0.5)})
-    m = ob.modifiers.new("m", "BOOLEAN")
-    m.object = other
-
-
-@pytest.mark.parametrize("change", [building_up, thinning_out, cut_out])
-def test_what_changes_its_topology_is_named(change):
-    change(cube("changing", size=1))
-    cube("steady", (2, 0, 0), 0.5)
-    tracks, untracked = track([1, 3, 5], 100)
-    assert untracked == ["changing"] and len(tracks) == 100
-    assert (tracks.position[:, 0, 0] * 1.7 + 0.2 > 1.7).all()
-
-
-def test_metaballs_volumes_and_hair_of_particles_are_named():
-    bpy.ops.object.metaball_add(radius=0.5)
-    ball = bpy.context.object
-    bpy.ops.object.metaball_add(radius=0.5)
-    key(bpy.context.object, "location", {1: (0, 0, 0), 5: (0.7, 0, 0)})
-    bpy.ops.mesh.primitive_plane_add()
-    fur = bpy.context.object
-    fur.name = "fur"
-    fur.modifiers.new("p", "PARTICLE_SYSTEM")
-    fur.particle_systems[0].settings.type = "HAIR"
-    bpy.ops.mesh.primitive_plane_add()
-    smoke = bpy.context.object
-    smoke.name = "smoke"
-
-    def build(add, connect, start, end):
-        connect(add("GeometryNodeVolumeCube").outputs[0], end)
-
-    geometry_nodes(smoke, build)
-    tracks, untracked = track([1, 3, 5], 100)
-    assert untracked == sorted([ball.name, "fur", "smoke"])
-    assert len(tracks) == 100 and np.ptp(tracks.position[..., 2]) < 1e-6  # the plane that the fur grows on
-
-
-def test_quads_that_are_cut_otherwise_at_another_frame_are_the_same_quads():
-    bpy.ops.mesh.primitive_plane_add(size=2)
-    ob = bpy.context.object
-    ob.shape_key_add(name="Basis")
-    dart = ob.shape_key_add(name="dart")
-    dart.data[1].co = (-0.3, 0.3, 0)  # the corner comes in: Blender cuts along the other diagonal
-    key(dart, "value", {1: 0.0, 5: 1.0})
-    cuts = {tuple(read_by_hand(f)[1].ravel()) for f in (1, 5)}
-    tracks, untracked = track([1, 5], 50)
-    assert len(cuts) == 2 and untracked == [] and len(tracks) == 50
-
-
-def test_too_much_to_keep_costs_the_largest_alone(monkeypatch):
-    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5)
-    bpy.context.object.name = "large"
-    cube("small", (2, 0, 0), 0.5)
-    monkeypatch.setattr("timesplat.datagen.scene.surfaces.MOST_FLOATS", 1000)
-    tracks, untracked = track([1, 2, 3], 100)
-    assert untracked == ["large"] and len(tracks) == 100
-
-
-def test_what_cannot_be_read_is_named(monkeypatch):
-    from timesplat.datagen.scene import surfaces
-
-    def fail(mesh):
-        raise RuntimeError
-
-    monkeypatch.setattr(surfaces, "_mesh", fail)
-    cube("broken")
-    tracks, untracked = track([1, 2], 100)
-    assert untracked == ["broken"] and len(tracks) == 0
-    assert tracks.position.shape == (0, 2, 3) and tracks.rotation.shape == (0, 2, 4)
 
 
 # ---------------------------------------------------------------- where the points lie
