@@ -37,6 +37,8 @@ from .sequence import (
     write_passes,
     write_sequence,
 )
+from .track_file import write_tracks
+from .tracks import track_surfaces
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,8 @@ def capture(
         (folder / "images").mkdir()
         if settings.passes:
             (folder / "passes").mkdir()
+        if settings.tracks is not None:
+            _write_tracks(seq, folder, subject, settings)
         with (
             tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as tmp,
             borrowed(subject.objects, lights=not settings.lighting) as stage,
@@ -171,6 +175,22 @@ def _write_view(
         if subject.shift is not None:
             displace.add_flow(passes, view, subject.shift)
         write_passes(folder / view.passes, passes, channels["combined"] if settings.linear else None)
+
+
+def _write_tracks(seq: Sequence, folder: Path, subject: Subject, settings: CaptureSettings) -> None:
+    """Writes the surface tracks below `folder`, and sets the Sequence's path and the names of what has none."""
+    pixel = float(np.median([np.linalg.norm(v.c2w[:3, 3]) / v.fx for v in seq.views]))
+    tracks, seq.untracked = track_surfaces(
+        subject.frames,
+        subject.normalisation,
+        pixel,
+        settings.tracks or 0,
+        objects=subject.objects,
+        shift=subject.shift,
+        seed=settings.seed,
+    )
+    seq.tracks = "tracks.npz"
+    write_tracks(folder / seq.tracks, tracks)
 
 
 def _scene_frames_per_frame(frames: list[int]) -> int:

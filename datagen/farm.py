@@ -220,6 +220,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--samples", type=int, default=defaults.samples, help="samples a pixel (%(default)s)")
     parser.add_argument("--no-passes", dest="passes", action="store_false", help="no depth, no motion vectors")
     parser.add_argument("--linear", action="store_true", help="also the scene-linear picture, in the passes' EXR")
+    parser.add_argument("--tracks", default=defaults.tracks, metavar="N", help="surface points: auto, none or so many")
     parser.add_argument("--displace", action="store_true", help="still objects, moved a little along a line")
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--device", default=defaults.device, choices=["CPU", "GPU"])

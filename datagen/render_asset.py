@@ -106,6 +106,7 @@ def _render_clip(
             samples=settings.samples,
             passes=settings.passes,
             linear=settings.linear,
+            tracks=settings.track_count,
             device=settings.device,
             seed=seed % 2**20,
         ),

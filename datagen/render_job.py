@@ -17,6 +17,7 @@ from .rigs import RIGS
 from .sequence import InputError, read_sequence
 
 FIRST_CLIP, MOST_MOVING_CLIP, ALL_CLIPS = "first", "most-moving", "all"  # what `RenderSettings.clip` may be
+_TRACKS = {"auto": 0, "none": None}
 _LEAST = {"frames": 1, "size": 8, "samples": 1, "targets": 0, "seed": 0}
 
 
@@ -33,6 +34,7 @@ class RenderSettings:
     samples: int = 16  # a pixel
     passes: bool = True  # also depth and motion vectors
     linear: bool = False  # also the scene-linear picture, in the passes
+    tracks: str = "auto"  # surface points followed through the clip: "auto", "none", or so many
     displace: bool = False  # take a still object and move it a little, see `displace`
     seed: int = 0
     device: str = "CPU"  # or "GPU"
@@ -43,6 +45,13 @@ class RenderSettings:
         for name, least in _LEAST.items():
             if getattr(self, name) < least:
                 raise InputError(f"--{name} {getattr(self, name)}: too small; give {least} or more.")
+        if self.tracks not in _TRACKS and not re.fullmatch(r"[1-9][0-9]{0,6}", self.tracks):
+            raise InputError(f"--tracks {self.tracks}: not a number of points; give one, auto or none.")
+
+    @property
+    def track_count(self) -> int | None:
+        """As `CaptureSettings.tracks` has it."""
+        return _TRACKS[self.tracks] if self.tracks in _TRACKS else int(self.tracks)
 
 
 def expand_folders(assets: list[str]) -> list[str]:

@@ -31,6 +31,7 @@ class CaptureSettings:
     samples: int = 16  # a pixel
     passes: bool = True  # also depth and motion vectors
     linear: bool = False  # with passes: also the scene-linear picture, in the same file
+    tracks: int | None = 0  # surface points followed through the clip; 0 = one for each patch of a pixel's size
     engine: str = "CYCLES"  # Blender's name of a render engine
     device: str = "CPU"  # Cycles': or "GPU", the one chosen in Blender's preferences
     threads: int = 0  # 0 = all cores

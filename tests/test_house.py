@@ -64,9 +64,10 @@ LAYERS = {
     ),
     "datagen": (
         ("datagen.image_files", "datagen.rigs", "datagen.track_file"),
+        ("datagen.outside", "datagen.spread", "datagen.moving_frames"),
         ("datagen.sequence",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
-        ("datagen.render_setup",),
+        ("datagen.render_setup", "datagen.tracks"),
         ("datagen.capture",),
         ("datagen.render_asset", "datagen.farm"),
     ),

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import bpy
 import numpy as np
@@ -14,6 +15,8 @@ import numpy as np
 from ..sequence import InputError, Normalisation
 from .borrow import borrowed
 from .gltf import LARGEST_COORDINATE
+
+T = TypeVar("T")
 
 
 def check_vertices(path: Path | str, name: str, points: np.ndarray) -> None:
@@ -45,14 +48,20 @@ def _local_points(ob) -> np.ndarray:
     return np.array(ob.bound_box if ob.type == "VOLUME" else [], float).reshape(-1, 3)
 
 
+def shown_instances(depsgraph) -> Iterator:
+    """The instances that an evaluated scene shows to cameras. Each is gone when the next one comes."""
+    for instance in depsgraph.object_instances:
+        ob, top = instance.object, instance.parent or instance.object
+        if not top.hide_render and instance.show_self and ob.visible_camera and top.visible_camera:
+            yield instance
+
+
 def world_vertices(depsgraph) -> list[tuple[str, np.ndarray]]:
     """(object name, (N,3) float64 world coordinates) of each instance of a shape that an evaluated scene shows to
     cameras."""
     found = []
-    for instance in depsgraph.object_instances:
-        ob, top = instance.object, instance.parent or instance.object
-        if top.hide_render or not (instance.show_self and ob.visible_camera and top.visible_camera):
-            continue
+    for instance in shown_instances(depsgraph):
+        ob = instance.object
         points, matrix = _local_points(ob), np.array(instance.matrix_world)
         if len(points):
             found.append((ob.name, points @ matrix[:3, :3].T + matrix[:3, 3]))
@@ -64,11 +73,12 @@ class _MeasuringEngine(bpy.types.RenderEngine):
     and visibility."""
 
     bl_idname, bl_label = "TIMESPLAT_MEASURE", "Timesplat"
-    results: ClassVar[list] = []  # of each render: its `world_vertices`, or the exception
+    measure: ClassVar[list] = []  # its last is the function that is given the evaluated scene
+    results: ClassVar[list] = []  # of each render: what that returned, or the exception
 
     def render(self, depsgraph) -> None:
         try:
-            self.results.append(world_vertices(depsgraph))
+            self.results.append(self.measure[-1](depsgraph))
         except Exception as e:  # Blender would print it and go on
             self.results.append(e)
 
@@ -76,14 +86,25 @@ class _MeasuringEngine(bpy.types.RenderEngine):
 def vertices_at(frames: list[int], objects: list | None = None, *, rendered: bool = True) -> Iterator[list]:
     """`world_vertices` at each of the scene frames, as renders show them, which replaces the session's render result;
     rendered False: as the viewport does."""
+    if rendered:
+        yield from as_rendered(frames, world_vertices, objects)
+        return
     with borrowed(objects) as stage, contextlib.ExitStack() as cleanup:
-        if rendered:
-            _prepare_measuring_render(stage, cleanup)
-        else:
-            _show_in_viewport(stage.view_layers[0], cleanup)
+        _show_in_viewport(stage.view_layers[0], cleanup)
         for frame in dict.fromkeys(frames):
             stage.frame_set(frame)
-            yield _rendered_vertices(stage) if rendered else world_vertices(stage.view_layers[0].depsgraph)
+            yield world_vertices(stage.view_layers[0].depsgraph)
+
+
+def as_rendered(frames: Sequence[float], measure: Callable[[Any], T], objects: list | None = None) -> Iterator[T]:
+    """What `measure` makes of the evaluated scene (a depsgraph) as renders show it, once at each of the scene frames,
+    whole or not. Replaces the session's render result."""
+    with borrowed(objects) as stage, contextlib.ExitStack() as cleanup:
+        _prepare_measuring_render(stage, cleanup)
+        for frame in dict.fromkeys(frames):
+            whole = math.floor(frame)
+            stage.frame_set(whole, subframe=frame - whole)
+            yield _measured(stage, measure)
 
 
 def _prepare_measuring_render(stage, cleanup: contextlib.ExitStack) -> None:
@@ -98,9 +119,13 @@ def _prepare_measuring_render(stage, cleanup: contextlib.ExitStack) -> None:
     render.use_stamp, stage.view_layers[0].use = False, True
 
 
-def _rendered_vertices(stage) -> list[tuple[str, np.ndarray]]:
-    with bpy.context.temp_override(scene=stage):
-        bpy.ops.render.render()
+def _measured(stage, measure: Callable[[Any], T]) -> T:
+    _MeasuringEngine.measure.append(measure)
+    try:
+        with bpy.context.temp_override(scene=stage):
+            bpy.ops.render.render()
+    finally:
+        _MeasuringEngine.measure.pop()
     result = _MeasuringEngine.results.pop()
     if isinstance(result, Exception):
         raise result

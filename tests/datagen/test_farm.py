@@ -58,6 +58,7 @@ def test_a_folder_of_assets(assets, tmp_path):
     assert p["scene_frames"] == [0, 1, 2, 3] and p["blender"].startswith(str(bpy.app.version[0]))
     assert p["settings"]["samples"] == 1
     assert np.isfinite(seq.load_passes(0).depth).any() and seq.load_image(0)[..., 3].any()
+    assert len(seq.load_tracks()) == 4000 and seq.untracked == []
     still = read_sequence(tmp_path / "still" / "static")
     assert (still.frame_start, still.frame_end, len(still.views)) == (0, 0, 1)
     assert not list(tmp_path.rglob(".*"))
@@ -150,13 +151,17 @@ def test_the_command_line(assets, tmp_path, capsys):
     text = capsys.readouterr()
     assert "1 sequences" in text.out and "1 failed" in text.out and "no such file" in text.err
     made = json.loads((tmp_path / "still" / "static" / "transforms.json").read_text())
-    assert "exr_path" not in made["frames"][0] and made["w"] == 24
+    assert "exr_path" not in made["frames"][0] and made["w"] == 24 and made["tracks_path"] == "tracks.npz"
+    assert farm.run(arguments(assets / "still.glb", *small, "--tracks", "none")) == 0
+    made = json.loads((tmp_path / "still" / "static" / "transforms.json").read_text())
+    assert "tracks_path" not in made and not (tmp_path / "still" / "static" / "tracks.npz").exists()
     for wrong in (
         small,
         [tmp_path / "still" / "static" / "images", *small],
         ["--zoo", "1-x", *small],
         [assets, *small, "--size", 4],
         [assets, *small, "--samples", 0],
+        [assets, *small, "--tracks", "some"],
     ):
         with pytest.raises(InputError, match=r"^[^\n]*;[^\n]*\.$"):
             farm.run(arguments(*wrong))

@@ -8,11 +8,20 @@ from timesplat.datagen.sequence import InputError
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"rig": "x"}, {"size": 7}, {"samples": 0}, {"frames": 0}, {"targets": -1}, {"seed": -1}]
+    "wrong",
+    [
+        *({"rig": "x"}, {"size": 7}, {"samples": 0}, {"frames": 0}, {"targets": -1}, {"seed": -1}),
+        *({"tracks": text} for text in ("many", "0", "-5", "1.5", "", "12345678")),
+    ],
 )
 def test_settings_that_cannot_be(wrong):
     with pytest.raises(InputError, match=rf"^--{next(iter(wrong))} [^\n]*;[^\n]*\.$"):
         RenderSettings(**wrong)
+
+
+@pytest.mark.parametrize(("text", "count"), [("auto", 0), ("none", None), ("500", 500)])
+def test_how_many_tracks(text, count):
+    assert RenderSettings(tracks=text).track_count == count
 
 
 def test_names_of_assets():
