@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Two scenes that the tables of tracks need beside assets: a chequered cloth that falls over a ball, and a ring that turns
-and sways, scattered with cones by Geometry Nodes.
+"""Two scenes that the tables of tracks need beside assets: a chequered cloth that falls over a ball, and a ring that
+turns and sways, scattered with cones by Geometry Nodes.
 
     python benchmarks/track_scenes.py FOLDER        # writes cloth.blend and scatter.blend
 """
@@ -85,7 +85,11 @@ def _scatter(bpy) -> None:
         new("GeometryNodeInstanceOnPoints"),
         new("GeometryNodeObjectInfo"),
     )
-    some, normal, upright = new("FunctionNodeRandomValue"), new("GeometryNodeInputNormal"), new("FunctionNodeAlignRotationToVector")
+    some, normal, upright = (
+        new("FunctionNodeRandomValue"),
+        new("GeometryNodeInputNormal"),
+        new("FunctionNodeAlignRotationToVector"),
+    )
     some.data_type = "BOOLEAN"
     some.inputs["Probability"].default_value = 0.15
     upright.axis = "Z"

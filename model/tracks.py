@@ -142,6 +142,14 @@ class Tracks4D:
     def from_asset(asset: Asset) -> Tracks4D:
         """Of an asset that has paths."""
         offset, rotation = asset.on_path()
-        looks = {"offset": offset, "scale": asset.scale, "rotation": rotation, "rgb": asset.rgb, "opacity": asset.opacity}
+        looks = {
+            "offset": offset,
+            "scale": asset.scale,
+            "rotation": rotation,
+            "rgb": asset.rgb,
+            "opacity": asset.opacity,
+        }
         tensors = {k: torch.from_numpy(np.array(a, np.float32)) for k, a in looks.items()}
-        return Tracks4D(**tensors, path=torch.from_numpy(asset.path.astype(np.int64)), paths=Paths.from_numpy(asset.paths))
+        return Tracks4D(
+            **tensors, path=torch.from_numpy(asset.path.astype(np.int64)), paths=Paths.from_numpy(asset.paths)
+        )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Tracks fitted to views by gradient descent: their looks and offsets, while the paths stay as they are known.
 
-Every view of the clip speaks of every track that it sees, so that nothing is learnt by heart from a moment's few. Now and
-then the faint are removed, and those whose offsets the views pull at hardest are split in two on the same path.
+Every view of the clip speaks of every track that it sees, so that nothing is learnt by heart from a moment's few. Now
+and then the faint are removed, and those whose offsets the views pull at hardest are split in two on the same path.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..rotations import rotation_matrix
 from ..tracks import Tracks4D
 from ..views import Views
 from .fit_views import detached
-from .loop import Schedule, Step, gradients, optimise, photometric_loss
+from .loop import Schedule, gradients, optimise, photometric_loss
 from .parameters import Parameters
 
 
@@ -64,7 +64,14 @@ def activate_tracks(raw: dict[str, Tensor], like: Tracks4D) -> Tracks4D:
 
 
 def fit_tracks(
-    start: Tracks4D, views: Views, schedule: Schedule, *, pixel: float, max_tracks: int, fit: TrackFit = FIT, progress=None
+    start: Tracks4D,
+    views: Views,
+    schedule: Schedule,
+    *,
+    pixel: float,
+    max_tracks: int,
+    fit: TrackFit = FIT,
+    progress=None,
 ) -> Tracks4D:
     """N tracks fitted to the views, split up to `max_tracks`. pixel: size at the object. For `progress` see
     `optimise`."""

@@ -26,7 +26,7 @@ BLOCK = 4_000_000  # distances computed at a time
 def share_paths(place: Tensor, turn: Tensor, window: Tensor, tolerance: float, seed: int = 0) -> tuple[Tensor, Tensor]:
     """place (N,F,3), turn (N,F,4) and window (N,2) of N points: only points of one window share a path ->
     the point whose path each rides on (N,), and its offset in that moving frame (N,3): the mean over the frames."""
-    n, frames = place.shape[:2]
+    n = len(place)
     generator = torch.Generator().manual_seed(seed)
     owner, offset = torch.arange(n), place.new_zeros(n, 3)
     _, group = window.unique(dim=0, return_inverse=True)
@@ -142,7 +142,15 @@ def _slerp(a: Tensor, b: Tensor, part: Tensor) -> Tensor:
 
 
 def _distance(
-    place: Tensor, turn: Tensor, window: Tensor, reach: Tensor, first: Tensor, last: Tensor, who: Tensor, p: Tensor, q: Tensor
+    place: Tensor,
+    turn: Tensor,
+    window: Tensor,
+    reach: Tensor,
+    first: Tensor,
+    last: Tensor,
+    who: Tensor,
+    p: Tensor,
+    q: Tensor,
 ) -> Tensor:
     """(n,) how far the paths `who`, with knots p (n,k,3), q (n,k,4), are from where they should be, at most, at the
     frames of their windows: by place, and by rotation at the distance `reach`. Signs of q are made to agree."""

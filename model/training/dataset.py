@@ -208,9 +208,7 @@ def shrink(views: Views, by: int) -> Views:
     alpha = blocks(views.alpha[..., None])
     total = alpha.mean(3)
     rgb = (blocks(views.rgb) * alpha).mean(3) / total.clamp_min(1e-6)
-    small = replace(
-        views, rgb=rgb, alpha=total[..., 0], intrinsics=views.intrinsics / by, depth=None, flow=None
-    )
+    small = replace(views, rgb=rgb, alpha=total[..., 0], intrinsics=views.intrinsics / by, depth=None, flow=None)
     if views.depth is None or views.flow is None:
         return small
     depth, flow = blocks(views.depth[..., None]), blocks(views.flow)

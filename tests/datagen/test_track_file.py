@@ -47,7 +47,7 @@ def test_what_is_wrong_is_said(tmp_path, what, change):
 
 def test_a_pickle_or_half_a_file_is_refused(tmp_path):
     np.savez(tmp_path / "t.npz", **vars(some()) | {"area": np.array([print] * 5, object)})
-    with pytest.raises(ValueError, match="[Pp]ickle|Object"):
+    with pytest.raises(ValueError, match=r"[Pp]ickle|Object"):
         read_tracks(tmp_path / "t.npz", 3)
     write_tracks(tmp_path / "t.npz", some())
     whole = (tmp_path / "t.npz").read_bytes()
