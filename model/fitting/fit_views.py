@@ -24,7 +24,7 @@ TENSORS = ("rgb", "alpha", "c2w", "intrinsics", "time")  # of Views, as fits use
 
 
 def detached(views: Views, device="cpu") -> Views:
-    """Copies of the colour, alpha, cameras and times on a device: free of inference mode, and of what is not among these."""
+    """Copies of the colour, alpha, cameras and times on a device: free of inference mode, and nothing but these."""
     return replace(
         views, depth=None, flow=None, surface=None, **{k: getattr(views, k).to(device).clone() for k in TENSORS}
     )

@@ -127,8 +127,8 @@ def _counts(frames: int) -> list[int]:
 
 
 def _between(place: Tensor, turn: Tensor, who: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """The paths `who` (n,) at the (n,k) frames `at`, fractions too -> (n,k,3), (n,k,4); of what comes or goes within the
-    clip the frames beyond hold its end."""
+    """The paths `who` (n,) at the (n,k) frames `at`, fractions too -> (n,k,3), (n,k,4); of what comes or goes within
+    the clip the frames beyond hold its end."""
     a = at.floor().long().clamp(0, place.shape[1] - 1)
     b = (a + 1).clamp_max(place.shape[1] - 1)
     part = (at - a)[..., None]
