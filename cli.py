@@ -102,8 +102,11 @@ def train(args: argparse.Namespace) -> int:
 def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote (or another in its format)")
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
-    p.add_argument("--method", default="guided", help="lift, guided, rgb, sweep, predicted, 4dgs (default: guided)")
-    p.add_argument("--seconds", type=float, default=10.0, help="for methods that fit the scene: 4dgs (default: 10)")
+    p.add_argument("--method", help="tracks, lift, guided, rgb, sweep, predicted, 4dgs (default: tracks "
+                   "where the renderer wrote surface tracks, else guided where it wrote depth, else rgb)")  # fmt: skip
+    p.add_argument(
+        "--seconds", type=float, default=10.0, help="for methods that fit the scene: tracks, 4dgs (default: 10)"
+    )
     p.add_argument("--refine", type=float, default=0.0, help="seconds of fitting the result to the views (default: 0)")
     p.add_argument("--budget", help="most Gaussians: a number, a share of those predicted such as 10%%, or auto: as "
                    "many as the scene needs; fits them for --refine seconds, or 5")  # fmt: skip
@@ -123,6 +126,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     from .model.geometry.coverage import coverage
     from .model.io.ply import write_ply
     from .model.methods import ReconstructOptions, method_named
+    from .model.reconstruct import default_method, untracked_note
     from .model.reconstruct import reconstruct as run
     from .model.views import load_views
 
@@ -140,10 +144,13 @@ def reconstruct(args: argparse.Namespace) -> int:
     if args.rig and args.rig not in rigs:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else [i for i, v in enumerate(seq.views) if v.rig != "target"]
-    g = run(seq, args.method, indices, options)
+    method = method_named(args.method or default_method(seq, indices))
+    g = run(seq, method.name, indices, options)
     write_ply(args.out, g.to_asset(clip_of(seq)))
-    print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {time.perf_counter() - start:.1f} s")
-    method = method_named(args.method)
+    taken = time.perf_counter() - start
+    print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")
+    if method.name == "tracks" and (note := untracked_note(seq)):
+        print(note)
     if method.knows_surface and not (args.refine or args.budget):
         share, _ = coverage(g, load_views(seq, indices, method.has_depth))
         print(f"coverage {share:.0%}" + ("" if share > 0.99 else ": what no camera saw is left open"))

@@ -18,6 +18,7 @@ from ..datagen.farm import render_assets
 from ..datagen.render_job import RenderSettings
 from ..datagen.sequence import Sequence, read_sequence, sequences_in
 from ..model.gaussians import FIELDS, Gaussians4D, ReconstructedScene
+from ..model.tracks import LOOKS, Paths, Tracks4D
 
 
 class Cache:
@@ -80,19 +81,31 @@ class Cache:
 
     # ---------------------------------------------------------------- scenes
 
-    def scene(self, key: str) -> Gaussians4D | None:
+    def scene(self, key: str) -> Gaussians4D | Tracks4D | None:
         """The scene of a run that was kept, if it was."""
         path = self._scene_path(key)
-        return Gaussians4D(**load_file(path)) if path.is_file() else None
+        if not path.is_file():
+            return None
+        tensors = load_file(path)
+        if "path" not in tensors:
+            return Gaussians4D(**tensors)
+        of_paths = {k.removeprefix("paths."): tensors.pop(k) for k in list(tensors) if k.startswith("paths.")}
+        return Tracks4D(**tensors, paths=Paths(**of_paths))
 
     def keep_scene(self, key: str, scene: Gaussians4D | ReconstructedScene) -> None:
-        """Keeps a scene of 4D Gaussians, whole or not at all; other kinds are not kept."""
-        if not isinstance(scene, Gaussians4D):
+        """Keeps a scene of 4D Gaussians or of tracks, whole or not at all; other kinds are not kept."""
+        if isinstance(scene, Gaussians4D):
+            axed = scene.with_axes()
+            tensors = {k: getattr(axed, k) for k in FIELDS}
+        elif isinstance(scene, Tracks4D):
+            tensors = {k: getattr(scene, k) for k in (*LOOKS, "path")}
+            tensors |= {f"paths.{k}": x for k, x in vars(scene.paths).items()}
+        else:
             return
-        path, axed = self._scene_path(key), scene.with_axes()
+        path = self._scene_path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         tmp = path.with_suffix(".tmp")
-        save_file({k: torch.clone(getattr(axed, k)).contiguous() for k in FIELDS}, tmp)
+        save_file({k: torch.clone(x).contiguous() for k, x in tensors.items()}, tmp)
         tmp.replace(path)
 
     def _scene_path(self, key: str) -> Path:

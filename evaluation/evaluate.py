@@ -31,6 +31,7 @@ class EvaluateOptions:
     command: str = ""  # as it was typed, for the tables
     setup: str = "alternating"
     size: str = "128"
+    split: str = "test"
     protocol: str | None = None
     stride: str = "1"
     samples: int = 16
@@ -49,7 +50,10 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     d = EvaluateOptions([], Path())
     p.add_argument("assets", nargs="+", help="animated files, zoo:SEED, rendered Sequences, or folders of either")
     p.add_argument("--setup", default=d.setup, help="comma-separated: alternating, interpolation, rotating, "
-                   "random (all: these four), video, canonical, random-N, views-N (default: %(default)s)")  # fmt: skip
+                   "random (all: these four), video, canonical, random-N, views-N, split: all views but those held "
+                   "out, scored on those of --split (default: %(default)s)")  # fmt: skip
+    p.add_argument("--split", choices=list(protocol.SPLITS), default=d.split, help="for --setup split, which held-out "
+                   "views are scored: those of rig target, or of rig val (default: %(default)s)")  # fmt: skip
     p.add_argument("--size", default=d.size, help="comma-separated pixels, multiples of 8 (default: %(default)s); "
                    "rendered at the largest, the others are whole fractions of it")  # fmt: skip
     p.add_argument("--protocol", choices=["paper"], help="score four canonical and a random view a frame also for one "
@@ -106,7 +110,7 @@ def evaluate(options: EvaluateOptions) -> int:
         jobs=min(options.jobs, len(setups) * len(sequences)) if several or rendered else 1,
         deadline=time.time() + options.limit if options.limit is not None else float("inf"),
     )
-    rows = run_all(plan(sequences, methods, setups, sizes), cache, conditions)
+    rows = run_all(plan(sequences, methods, setups, sizes, options.split), cache, conditions)
     if not rows:
         raise InputError(f"{options.out}: nothing was scored in the time given; allow more.")
     metrics = gather(rows, Provenance.of(options.command, [m.weights for m in methods]))
@@ -116,10 +120,15 @@ def evaluate(options: EvaluateOptions) -> int:
 
 
 def plan(
-    sequences: dict[str, Sequence], methods: list[MethodSpec], setups: list[str], sizes: dict[int, int]
+    sequences: dict[str, Sequence],
+    methods: list[MethodSpec],
+    setups: list[str],
+    sizes: dict[int, int],
+    split: str = "test",
 ) -> list[Run]:
     """Every method on every Sequence {name: Sequence} in every setup ("" for all views that are not held out) at every
-    size {pixels: score every n-th frame}. Raises InputError where views are missing."""
+    size {pixels: score every n-th frame}; split: the held-out views that the setup "split" scores. Raises InputError
+    where views are missing."""
     from .runner import Run
 
     runs = []
@@ -127,7 +136,9 @@ def plan(
         for name, seq in sequences.items():
             inputs = protocol.inputs(seq, setup) if setup else protocol.all_inputs(seq)
             for size, stride in sizes.items():
-                targets, labels = protocol.targets(seq, stride), {"setup": setup, "stride": stride}
+                scored = protocol.held_out(seq, split) if setup == "split" else protocol.targets(seq)
+                targets = [i for i in scored if (seq.views[i].frame - seq.frame_start) % stride == 0]
+                labels = {"setup": setup, "stride": stride}
                 at = (tuple(inputs), tuple(targets), size, labels)
                 runs += [Run(name, seq.folder, m, *at) for m in methods if (m.method, setup) not in NOT_FOR]
     return runs

@@ -21,9 +21,10 @@ from ..datagen import rigs
 from ..datagen.sequence import InputError, Sequence
 
 TABLE = ("alternating", "interpolation", "rotating", "random")  # the columns of the paper's two main tables
-FIXED = (*TABLE, "video", "canonical")
+FIXED = (*TABLE, "video", "canonical", "split")
 FORMS = f"{', '.join(FIXED)}, random-N (N of 1 to 4 a frame) or views-N (N of 1 to 4 times the frames, in all)"
 RENDER = "render it with `timesplat render --rig evaluation --targets 1`"
+SPLITS = {"test": "target", "val": "val"}  # what is held out of a Sequence, by its rig
 EXACT = 1e-4  # cameras closer than this are the same
 
 
@@ -36,10 +37,12 @@ def check_setup(setup: str) -> str:
 
 def inputs(seq: Sequence, setup: str) -> list[int]:
     """Input views of a setup. alternating, interpolation, rotating, random, video: see `datagen.rigs.SETUPS`;
-    canonical: the four canonical cameras at every frame; random-N: N random views a frame; views-N: N
-    random views in all, spread evenly over the clip (views-24 of 24 frames is random).
+    canonical: the four canonical cameras at every frame; split: all that are not held out; random-N: N random
+    views a frame; views-N: N random views in all, spread evenly over the clip (views-24 of 24 frames is random).
     Raises InputError for an unknown setup, or where the Sequence lacks a view of it."""
     check_setup(setup)
+    if setup == "split":
+        return all_inputs(seq)
     frames = range(seq.frame_start, seq.frame_end + 1)
     if own := seq.select(rig=setup):  # rendered for this setup
         whole = setup != "random" or len({v.camera for v in seq.views if v.rig == "random"}) == 1
@@ -67,15 +70,18 @@ def inputs(seq: Sequence, setup: str) -> list[int]:
 
 
 def all_inputs(seq: Sequence) -> list[int]:
-    """All views that are not held out."""
-    return [i for i, v in enumerate(seq.views) if v.rig != "target"]
-
-
-def held_out(seq: Sequence) -> list[int]:
-    """The held-out views (rig "target"). Raises InputError where there are none."""
-    found = seq.select(rig="target")
+    """All views that are not held out. Raises InputError where there are none."""
+    found = [i for i, v in enumerate(seq.views) if v.rig not in SPLITS.values()]
     if not found:
-        raise InputError(f"{seq.root}: no held-out views to score; {RENDER}.")
+        raise InputError(f"{seq.root}: all of its views are held out; render some more.")
+    return found
+
+
+def held_out(seq: Sequence, split: str = "test") -> list[int]:
+    """The held-out views of a split of SPLITS. Raises InputError where there are none."""
+    found = seq.select(rig=SPLITS[split])
+    if not found:
+        raise InputError(f"{seq.root}: no held-out views to score (rig {SPLITS[split]}); {RENDER}.")
     return found
 
 

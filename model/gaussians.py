@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from .io.asset import Asset, Clip
+from .io.pieces import to_pieces
 from .rotations import isoclinic_rotation, rotation_matrix, scale_rotation_from_covariance
 
 
@@ -121,6 +122,8 @@ class Gaussians4D:
 
     @staticmethod
     def from_asset(asset: Asset) -> Gaussians4D:
+        """Of one whose Gaussians ride on paths: the straight pieces that stand in for it."""
+        asset = to_pieces(asset)
         return Gaussians4D(*(torch.from_numpy(getattr(asset, k).copy()) for k in FIELDS))
 
     @staticmethod

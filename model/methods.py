@@ -52,6 +52,7 @@ class Method:
     has_depth: bool = False  # sees depth and motion vectors; else RGB and alpha alone
     fits: bool = False  # to the scene, for some seconds
     baseline: bool = False  # what the product is compared with
+    budgets: bool = False  # keeps within options.budget itself
     checkpoint: str | None = None  # name of the shipped weights that it loads
     knows_surface: bool = False  # its Gaussians know which way their surface faces
 
@@ -77,6 +78,14 @@ def run_lift(views: Views, options: ReconstructOptions, progress: Progress | Non
     return lift(views)
 
 
+def run_tracks(views: Views, options: ReconstructOptions, progress: Progress | None) -> ReconstructedScene:
+    from .fitting.track_views import reconstruct_tracks
+
+    seconds = options.refine or options.seconds
+    told = {"budget": options.budget, "max_loss": options.max_loss, "progress": progress}
+    return reconstruct_tracks(views, seconds, **told)
+
+
 def load_predictor(options: ReconstructOptions) -> Callable[[Views], Gaussians4D]:
     """The network of options.checkpoint, from Views to Gaussians. Raises InputError as `load_network` does."""
     from .checkpoints_io import load_network
@@ -91,6 +100,14 @@ def run_network(views: Views, options: ReconstructOptions, progress: Progress | 
 
 
 register(
+    Method(
+        "tracks",
+        "ours: surface points followed through the clip, whose looks all views share, fitted",
+        run_tracks,
+        has_depth=True,
+        fits=True,
+        budgets=True,
+    ),
     Method(
         "lift",
         "ours: depth and motion vectors to Gaussians, no network",

@@ -17,19 +17,35 @@ from .views import Views, load_views
 DEFAULTS = ReconstructOptions()
 
 
+def default_method(sequence: Sequence, indices=None) -> str:
+    """What suits what was rendered: tracks where surfaces were followed, else guided where there is depth, else rgb."""
+    views = sequence.views if indices is None else [sequence.views[i] for i in indices]
+    if not all(v.passes for v in views):
+        return "rgb"
+    return "tracks" if sequence.tracks and len(sequence.load_tracks()) else "guided"
+
+
+def untracked_note(sequence: Sequence) -> str:
+    """What is to be said of objects whose surfaces could not be followed; nothing where there are none."""
+    names = ", ".join(sequence.untracked[:4]) + (" and others" if len(sequence.untracked) > 4 else "")
+    return f"{names}: the surface could not be followed, motion vectors lead it" if names else ""
+
+
 def reconstruct(
     sequence: Sequence,
-    method: str = "guided",
+    method: str | None = None,
     indices=None,
     options: ReconstructOptions = DEFAULTS,
     progress: Progress | None = None,
 ) -> Gaussians4D | ReconstructedScene:
-    """Views `indices` of the Sequence (all of them by default) -> the scene (N,), Gaussians filtered out that the
-    paper's inference filters would never draw. `progress(fraction, text)` is called between steps.
+    """Views `indices` of the Sequence (all of them by default), by a method (`default_method` where none is named) ->
+    the scene (N,), Gaussians filtered out that the paper's inference filters would never draw. `progress(fraction,
+    text)` is called between steps.
 
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint, and a device that cannot
     be used."""
     report = progress or (lambda fraction, text: None)
+    method = method or default_method(sequence, indices)
     has_depth = method_named(method).has_depth
     report(0.0, "reading views")
     indices = range(len(sequence.views)) if indices is None else indices
@@ -50,7 +66,7 @@ def reconstruct_views(
     chosen = method_named(method)
     if chosen.checkpoint and not options.checkpoint:
         options = replace(options, checkpoint=CHECKPOINTS / f"{chosen.checkpoint}.safetensors")
-    if not (options.refine or options.budget):
+    if chosen.budgets or not (options.refine or options.budget):
         return chosen.run(views, options, progress)
 
     from .fitting.budget import apply_budget

@@ -5,11 +5,11 @@ It reads one JSON object, from the file named or else from the first line of sta
 to do; null or "" is the same as leaving a key out:
     reconstruct (default)
         sequence    folder of a Sequence            asset       .ply to write
-        method      lift | guided | rgb | …         device      "cpu" (default), "cuda", …
+        method      tracks | lift | guided | …      device      "cpu" (default), "cuda", …
         checkpoint  weights to use                  indices     views to use (default: all)
-        refine      seconds of fitting (0)          budget      "N", "P%" or "auto"
-        max_loss    dB that "auto" may lose (0.1)
-        done: asset, gaussians
+        refine      seconds of fitting (0) …        budget      "N", "P%" or "auto"
+        max_loss    dB that "auto" may lose (0.1)   … which for tracks are all that there are
+        done: asset, gaussians, method, note (what the artist should know; a sentence or nothing)
     export          USD, where Blender has none     (never imports torch)
         asset       .ply to read                    out         .usd* to write
         mode        splats | points | frames        half        true or false
@@ -112,11 +112,13 @@ def _reconstruct(request: dict, progress) -> dict:
         # torch.optim, which loads them.
         sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
     from .clip import clip_of
-    from .reconstruct import ReconstructOptions, reconstruct  # imports torch
+    from .reconstruct import ReconstructOptions, default_method, reconstruct, untracked_note  # imports torch
 
+    method = request.get("method") or default_method(sequence, indices)
     options = ReconstructOptions(
         device=request.get("device", "cpu"),
         checkpoint=Path(checkpoint) if checkpoint else None,
+        seconds=refine,
         refine=refine,
         budget=budget,
         max_loss=max_loss,
@@ -125,7 +127,7 @@ def _reconstruct(request: dict, progress) -> dict:
     note = "" if compiled else "; the first run compiles, which takes half a minute"
     gaussians = reconstruct(
         sequence,
-        request.get("method", "guided"),
+        method,
         indices,
         options,
         progress=lambda fraction, text: progress(0.05 + 0.9 * fraction, text + note),
@@ -134,7 +136,8 @@ def _reconstruct(request: dict, progress) -> dict:
         raise InputError(f"{sequence.root}: nothing was found to reconstruct; check that views show the object.")
     progress(0.95, "writing the asset")
     write_ply(request["asset"], gaussians.to_asset(clip_of(sequence)))
-    return {"asset": request["asset"], "gaussians": len(gaussians)}
+    note = untracked_note(sequence) if method == "tracks" else ""
+    return {"asset": request["asset"], "gaussians": len(gaussians), "method": method, "note": note}
 
 
 def _limit_memory() -> None:

@@ -47,18 +47,26 @@ def pixel_size(views: Views) -> float:
     return float((views.c2w[:, :3, 3].norm(dim=-1) / views.intrinsics[:, 0]).median())
 
 
-def surface_tracks(surface: SurfaceTracks, views: Views, settings: TrackSettings = SETTINGS) -> Tracks4D:
-    """The points of `surface`, or as many of them as the views' pixels need, as N tracks on the CPU. The views have
-    depth."""
+def needed_points(surface: SurfaceTracks, views: Views, settings: TrackSettings = SETTINGS) -> int:
+    """How many points the views' pixels need, of those that there are."""
+    wanted = settings.points_a_pixel * float(surface.area.sum()) / pixel_size(views) ** 2
+    return min(round(min(max(wanted, settings.least), settings.most)), len(surface))
+
+
+def surface_tracks(
+    surface: SurfaceTracks, views: Views, count: int | None = None, settings: TrackSettings = SETTINGS
+) -> Tracks4D:
+    """`count` of the points of `surface`, or as many as the views' pixels need, as tracks on the CPU: one each, and two
+    on a sheet that is seen from both sides. The views have depth. None where there are no points."""
     pixel = pixel_size(views)
     whole = float(surface.area.sum())
-    wanted = min(max(settings.points_a_pixel * whole / pixel**2, settings.least), settings.most)
-    rows = np.linspace(0, len(surface) - 1, min(round(wanted), len(surface))).round().astype(int)
+    chosen = min(count or needed_points(surface, views, settings), len(surface))
+    rows = ((np.arange(chosen) + 0.5) * len(surface) / chosen).astype(int) if chosen else np.zeros(0, int)
     place = torch.from_numpy(surface.position[rows])
     turn = F.normalize(torch.from_numpy(surface.rotation[rows].astype(np.float32)), dim=-1)
     window = torch.from_numpy(np.stack([surface.first, surface.last], 1)[rows]).long()
     path, offset, rotation, paths = ride(place, turn, window, settings.tolerance * pixel)
-    spacing = (whole / len(rows)) ** 0.5
+    spacing = (whole / max(chosen, 1)) ** 0.5
     scale = spacing * torch.tensor([settings.footprint, settings.footprint, settings.thickness])
     n = len(rows)
     points = Tracks4D(

@@ -17,7 +17,7 @@ def named(**wanted) -> set[str]:
 
 def test_what_methods_are():
     assert all(name == m.name and m.about for name, m in METHODS.items())
-    assert named(has_depth=True) == {"lift", "guided"}
+    assert named(has_depth=True) == {"tracks", "lift", "guided"}
     assert named(knows_surface=True) == {"lift", "guided", "rgb", "sweep"}
     assert named(fits=True) == {"4dgs", "som"}
     assert named(baseline=False) == {"lift", "guided", "rgb", "sweep"}

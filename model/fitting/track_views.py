@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From views to tracks: the method `tracks`, within a budget where that is asked for.
+
+The points are those that the renderer followed, and where it could not, those that motion vectors lead; their number
+follows from the pixels, or from the budget. They start in the colours seen and are fitted to the views.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from ...datagen.sequence import InputError
+from ...datagen.track_file import SurfaceTracks
+from ..geometry.surface_tracks import needed_points, pixel_size, surface_tracks
+from ..tracks import Tracks4D
+from ..views import Views
+from .budget import FIRST_TRY, HELD_OUT, parse_budget
+from .fit_tracks import FIT, fit_tracks
+from .fit_views import squared_error, validation_views
+from .loop import Schedule, warm_up
+from .refine import part
+
+TRY_STEPS = 150  # of each fit by which `auto` looks for the fewest
+
+
+def reconstruct_tracks(
+    views: Views,
+    seconds: float,
+    *,
+    budget: str | None = None,
+    max_loss: float = 0.1,
+    steps: int | None = None,
+    seed: int = 0,
+    progress=None,
+) -> Tracks4D:
+    """Views with depth, motion vectors and, where the renderer wrote them, tracks of the surface -> tracks, after at
+    most `seconds` of fitting, or exactly `steps`; as they start for 0. budget: see `parse_budget`; a share is of the
+    points that the pixels need. max_loss: dB that `auto` may lose. Raises InputError where nothing can be followed."""
+    surface, search = followed(views), 0.0
+    count = None
+    if budget:
+        wanted, needed = parse_budget(budget), needed_points(surface, views)
+        if wanted is None:
+            search = 0.5
+            count = fewest(surface, views, max_loss, progress=part(progress, 0, search))
+        else:
+            count = max(round(wanted * needed) if isinstance(wanted, float) else wanted, 1)
+    start = surface_tracks(surface, views, count)
+    if not (seconds or steps) or not len(start):
+        return start
+    most = max(FIT.least_steps, FIT.steps_a_view * len(views))
+    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None, seed=seed)
+    told = part(progress, search, 1)
+    warm_up("cpu")
+    fitted = fit_tracks(start, views, schedule, pixel=pixel_size(views), progress=told)
+    return fitted if not count or len(fitted) <= count else fitted[fitted.opacity.topk(count).indices]
+
+
+def followed(views: Views) -> SurfaceTracks:
+    """The points that are followed through the clip. Raises InputError where there are none."""
+    if views.surface is None or not len(views.surface):
+        raise InputError("The views have no surface tracks; render them with --tracks auto, or take another method.")
+    return views.surface
+
+
+def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None) -> int:
+    """The fewest points with which a short fit comes within `max_loss` dB of one with twice as many, on views that
+    neither was fitted to; as many as the pixels need, if fewer do not. Raises InputError for a loss not above 0."""
+    if not max_loss > 0:
+        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
+    held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
+    kept = [i for i in range(len(views)) if i not in held_out] or held_out
+    fitted, unseen = views[kept], views[held_out]
+    most, count, tried = needed_points(surface, views), FIRST_TRY, []
+    schedule = Schedule(steps=TRY_STEPS, coarse_size=None)
+    while count < most:
+        told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
+        start = surface_tracks(surface, fitted, count)
+        with torch.no_grad():
+            error = squared_error(fit_tracks(start, fitted, schedule, pixel=pixel_size(views), progress=told), unseen)
+        tried.append(-10 * math.log10(max(error, 1e-10)))
+        if len(tried) > 1 and tried[-1] - tried[-2] <= max_loss:
+            return count // 2
+        count *= 2
+    return most
