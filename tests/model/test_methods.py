@@ -19,7 +19,7 @@ def test_what_methods_are():
     assert all(name == m.name and m.about for name, m in METHODS.items())
     assert named(has_depth=True) == {"tracks", "lift", "guided"}
     assert named(knows_surface=True) == {"lift", "guided", "rgb", "sweep"}
-    assert named(fits=True) == {"4dgs", "som"}
+    assert named(fits=True) == {"tracks", "4dgs", "som"}
     assert named(baseline=False) == {"lift", "guided", "rgb", "sweep"}
     assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"}
     assert named(checkpoint="sweep") == {"rgb", "sweep"}
@@ -30,7 +30,7 @@ def test_a_method_is_found_by_its_name(monkeypatch):
     monkeypatch.setattr("timesplat.model.methods.METHODS", dict(METHODS))
     register(Method("mine", "a test's", lambda views, options, progress: views))
     assert method_named("mine").run(3, None, None) == 3
-    with pytest.raises(InputError, match=r"^magic: no such method; choose one of lift, guided, .*mine\.$"):
+    with pytest.raises(InputError, match=r"^magic: no such method; choose one of tracks, lift, guided, .*mine\.$"):
         method_named("magic")
 
 
@@ -39,7 +39,7 @@ def test_without_baselines_there_are_the_products_methods():
     code = "import timesplat.model.reconstruct as r, sys; from timesplat.model.methods import METHODS; print(*METHODS)"
     code += "; print([m for m in sys.modules if 'baselines' in m])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.splitlines() == ["lift guided rgb sweep predicted", "[]"]
+    assert out.splitlines() == ["tracks lift guided rgb sweep predicted", "[]"]
 
 
 @pytest.mark.parametrize(
