@@ -20,9 +20,9 @@ def test_what_methods_are():
     assert named(has_depth=True) == {"tracks", "lift", "guided"}
     assert named(knows_surface=True) == {"lift", "guided", "rgb", "sweep"}
     assert named(fits=True) == {"tracks", "4dgs", "som"}
-    assert named(baseline=False) == {"lift", "guided", "rgb", "sweep"}
+    assert named(baseline=False) == {"lift", "guided", "rgb", "sweep", "tracks"}
     assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"}
-    assert named(checkpoint="sweep") == {"rgb", "sweep"}
+    assert named(checkpoint="sweep") == {"rgb", "sweep", "tracks"}
     assert all(m.about.startswith("ours") != m.baseline for m in METHODS.values())
 
 
