@@ -22,7 +22,7 @@ def test_what_methods_are():
     assert named(fits=True) == {"tracks", "4dgs", "som"}
     assert named(baseline=False) == {"lift", "guided", "rgb", "sweep", "tracks"}
     assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"}
-    assert named(checkpoint="sweep") == {"rgb", "sweep", "tracks"}
+    assert named(checkpoint="sweep") == {"rgb", "sweep"}
     assert all(m.about.startswith("ours") != m.baseline for m in METHODS.values())
 
 
