@@ -7,6 +7,7 @@ What no view sees takes the colour of the nearest point that one does.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...datagen.track_file import SurfaceTracks
+from ..rasterize.constants import BLUR
 from ..rotations import rotation_matrix
 from ..tracks import LOOKS, Tracks4D
 from ..views import Views
@@ -34,7 +36,8 @@ class TrackSettings:
     least_share: float = 0.4  # of what is seen of a point must be seen of a side that has looks of its own
     apart: float = 0.15  # how far above the surface the two sides of a sheet are, in pixels
     inset: float = 0.8  # how far below the surface a track sits, in pixels: its own width reaches back out to it
-    opacity: float = 0.35
+    cover: float = 0.93  # opacity that the tracks have together at each place of the surface …
+    opacity: float = 0.95  # … and one has at most
     depth_tolerance: float = 0.3  # pixels by which a visible point may miss the depth, if its surface is not steep
 
 
@@ -66,12 +69,14 @@ def surface_tracks(
     turn = F.normalize(torch.from_numpy(surface.rotation[rows].astype(np.float32)), dim=-1)
     window = torch.from_numpy(np.stack([surface.first, surface.last], 1)[rows]).long()
     path, offset, rotation, paths = ride(place, turn, window, settings.tolerance * pixel)
-    spacing = (whole / max(chosen, 1)) ** 0.5
+    spacing = (whole / chosen) ** 0.5 if chosen else pixel
+    # Seen squarely, by how many each place is covered, as wide as the rasteriser draws them. More opacity than this
+    # makes silhouettes, where one looks along the surface, too wide: that cost 5 dB.
+    layers = 2 * math.pi * (settings.footprint**2 + BLUR * (pixel / spacing) ** 2)
+    opacity = min(settings.opacity, settings.cover / layers)
     scale = spacing * torch.tensor([settings.footprint, settings.footprint, settings.thickness])
     n = len(rows)
-    points = Tracks4D(
-        offset, scale.expand(n, 3), rotation, torch.zeros(n, 3), torch.full((n,), settings.opacity), path, paths
-    )
+    points = Tracks4D(offset, scale.expand(n, 3), rotation, torch.zeros(n, 3), torch.full((n,), opacity), path, paths)
     total, weight = colours(points, views, settings.depth_tolerance)
     # A thin sheet that is seen from both sides has looks on each, which sit on it; what is closed has them below it.
     known = weight > settings.least_share * weight.sum(0)
