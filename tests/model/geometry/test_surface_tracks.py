@@ -29,7 +29,7 @@ def test_the_start_already_looks_like_it():
     assert scenes.psnr(tracks, others) > white + 5
     normal = scenes.sphere_points(600)
     right = (tracks.rgb - scenes.pattern(normal)).abs().amax(-1) < 0.25
-    assert right.float().mean() > 0.7  # the others lie on the edges of bands
+    assert right.float().mean() > 0.6  # the others lie on the edges of bands
 
 
 def test_what_no_view_sees_takes_the_colour_of_its_neighbour():
