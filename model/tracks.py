@@ -94,11 +94,10 @@ class Tracks4D:
         """The Gaussians as they are at time t in [-1,1], for ever; differentiable in the looks, and in the knots' place
         and rotation."""
         place, turn = self.paths.at(t)
-        place, turn = place[self.path], turn[self.path]
+        xyz, rotation = self._ride(place, turn)
         opacity = self.opacity
         if not (there := self.paths.there(t)).all():
             opacity = opacity * there[self.path]
-        xyz = place + rotate(turn, self.offset)
         still = torch.zeros_like(self.opacity)
         return Gaussians4D(
             xyz=xyz,
@@ -106,10 +105,20 @@ class Tracks4D:
             velocity=torch.zeros_like(xyz),
             sigma_t=torch.full_like(self.opacity, STATIC_SIGMA_T),
             scale=self.scale,
-            rotation=quaternion_multiply(turn, self.rotation),
+            rotation=rotation,
             rgb=self.rgb,
             opacity=opacity,
         )
+
+    def _ride(self, place: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+        """place (P,3), turn (P,4) of the paths -> place (N,3) and rotation (N,4) of the Gaussians."""
+        knots_move = place.requires_grad or turn.requires_grad
+        if self.offset.dtype == torch.float32 and not self.offset.is_cuda and not knots_move:
+            from .riding import Ride  # compiled
+
+            return Ride.apply(self.path, place, turn, self.offset, self.rotation)
+        place, turn = place[self.path], turn[self.path]
+        return place + rotate(turn, self.offset), quaternion_multiply(turn, self.rotation)
 
     def alive(self, opacity: float = 0.05) -> Tensor:
         """(N,) bool: whether the paper's inference filter lets the Gaussian through (appendix A.2)."""

@@ -22,7 +22,7 @@ TENSORS = {"torch", "torchvision", "gsplat", "triton", "numba", "safetensors"}
 LAYERS = {
     "model": (
         ("model.io",),
-        ("model.parallel", "model.rotations", "model.devices", "model.layout"),
+        ("model.parallel", "model.riding", "model.rotations", "model.devices", "model.layout"),
         ("model.gaussians", "model.tracks", "model.views", "model.clip"),
         ("model.rasterize",),
         ("model.geometry",),

@@ -80,6 +80,22 @@ def test_gradients_of_looks_and_knots():
     assert torch.autograd.gradcheck(slice_of, [x.clone().requires_grad_() for x in inputs])
 
 
+@pytest.mark.parametrize("n", [1, 20_000])
+def test_compiled_as_by_torch(n):
+    """Values and gradients, on one chunk and on several."""
+    tracks, rng = some_tracks(n), torch.Generator().manual_seed(1)
+    weights = torch.randn(n, 3, generator=rng), torch.randn(n, 4, generator=rng)
+    found = []
+    for dtype in (torch.float32, torch.float64):  # the latter goes by torch
+        leaves = [x.to(dtype).clone().requires_grad_() for x in (tracks.offset, tracks.rotation)]
+        paths = Paths(*(x if k == "count" else x.to(dtype) for k, x in vars(tracks.paths).items()))
+        g = replace(tracks, offset=leaves[0], rotation=leaves[1], paths=paths).at(0.3)
+        ((g.xyz * weights[0]).sum() + (g.rotation * weights[1]).sum()).backward()
+        found.append([g.xyz, g.rotation, *(x.grad for x in leaves)])
+    for a, b in zip(*found, strict=True):
+        assert a.dtype == torch.float32 and torch.allclose(a.double(), b, atol=1e-5)
+
+
 def test_drawn_as_its_slices_are():
     """Also of several moments at once, side by side."""
     tracks, times = some_tracks(), [-1.0, -0.2, 0.4, 0.4, 1.0]
