@@ -33,13 +33,13 @@ class Axes:
     centre: tuple[str, ...] = (
         *("lift", "guided", "rgb", "predicted", "gs-lrm-all", "gs-lrm-frame", "hull"),
         *("guided+dense", "rgb+dense", "predicted+dense"),
-        *(f"{name}:{s}" for name in ("4dgs", "som") for s in (1, 3, 10, 30)),
+        *(f"{name}:{s}" for name in ("tracks", "4dgs", "som") for s in (1, 3, 10, 30)),
         *(f"{name}+refine:{s}" for name in ("guided", "rgb") for s in (1, 3, 10, 30)),
         *(f"rgb+refine:{s}" for s in (0.1, 0.3, 0.6, 2)),
         *(f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in ("2.5%", "5%", "10%", "25%", "auto")),
         *(f"rgb+refine:3+budget:{n}" for n in (500, 1000, "auto")),
     )
-    elsewhere: tuple[str, ...] = ("lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3")
+    elsewhere: tuple[str, ...] = ("tracks:3", "lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3")
     quick: float = 3.0  # seconds of fitting that a quick run has at the most
 
 

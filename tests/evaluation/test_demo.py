@@ -21,7 +21,7 @@ def out(tmp_path_factory):
 
 def test_demo_writes_what_it_promises(out):
     metrics = json.loads((out / "metrics.json").read_text())
-    assert set(metrics["methods"]) == {"white", "hull", "lift", "guided", "guided+budget:10%", "rgb"}
+    assert set(metrics["methods"]) == {"white", "hull", "lift", "guided", "guided+budget:10%", "tracks:5", "rgb"}
     assert all(set(m) >= KEYS for m in metrics["methods"].values())
     assert set(metrics["seconds"]) >= {"rendering", "lift", "guided", "rgb", "export"}
     assert metrics["methods"]["lift"]["psnr"] > metrics["methods"]["hull"]["psnr"]
@@ -29,7 +29,7 @@ def test_demo_writes_what_it_promises(out):
     with Image.open(out / "turntable.webp") as film:
         assert film.n_frames == 24
     asset = read_ply(out / "asset.ply")
-    assert len(asset) == len(read_usd(out / "asset.usdc")) == metrics["methods"]["guided+budget:10%"]["gaussians_kept"]
+    assert len(asset) == len(read_usd(out / "asset.usdc")) == metrics["methods"]["tracks:5"]["gaussians_kept"]
     assert (out / "asset.blend").read_bytes()[:4] in (b"BLEN", b"\x28\xb5\x2f\xfd")  # plain, or zstd-compressed
     assert not [p for p in out.iterdir() if p.name.startswith(".")]
 
