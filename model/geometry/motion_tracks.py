@@ -22,7 +22,7 @@ from .lift import surface_seen
 from .scene_flow import single
 
 # (numba's cache does not see another file change: where tracking.py or EXTENT is changed, this file must be touched.)
-from .tracking import flow_at, known_motion, satisfy
+from .tracking import flow_at, known_motion
 
 UNKNOWN, FREE = -1, -2  # pixels that say nothing, and that show that there is nothing
 
@@ -39,6 +39,8 @@ class MotionSettings(NamedTuple):
     sheet: float = 0.5  # the same for a surface seen from behind
     steepest: float = 0.2  # cosine: pixels that see the surface under less start no points
     unseen: int = 24  # frames that a point is followed without being seen
+    prior: float = 0.03  # weight of the scene flow against what motion vectors say of a point's own step
+    depth: float = 4.0  # weight of the depth of what is seen, as a multiple of that of its motion
     turn: float = 0.3  # share by which a normal that is seen turns the point's
 
 
@@ -243,18 +245,47 @@ def _seen_at(p, normal, j, tolerance, surface, rules):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _learn(r, side, sign, interval, surface, field, m, flow, more):
-    """Changes more (3), what is added to the scene flow, by the least such that the motion vector of row r holds, to the
-    next frame (side 1) or the previous one (0); sign: 1 if `more` is of a motion to the next frame, -1 to the previous.
-    m (6) and flow (3) are written over."""
+def _gather(p, r, weight, side, sign, interval, surface, field, m, flow, rows):
+    """Adds to rows (9), the lower triangle of the normal equations of what the scene flow lacks at p (3) and their right
+    side, what the motion vector of row r says, to the next frame (side 1) or the previous one (0); sign: 1 if they are
+    of a motion to the next frame, -1 to the previous. m (6) and flow (3) are written over."""
     turned = np.float32(2 * side - 1)  # the way of the motion vector
     flow_at(field, interval, surface.place[r], m, flow)
+    A = surface.constraint[r, side]
+    for i in range(2):
+        b = turned * A[6 + i]
+        for k in range(3):
+            b -= A[3 * i + k] * flow[k]
+        q = 0
+        for k in range(3):
+            w = weight * A[3 * i + k]
+            for n in range(k + 1):
+                rows[q] += w * A[3 * i + n]
+                q += 1
+            rows[6 + k] += w * sign * b
+
+
+@numba.njit(cache=True, fastmath=True)
+def _solve(rows, prior, out):
+    """out (3) of the normal equations rows (9), with `prior` on the diagonal."""
+    a, b, c, d, e, f = rows[0] + prior, rows[1], rows[2] + prior, rows[3], rows[4], rows[5] + prior
+    aa, bb, cc, dd, ee, ff = c * f - e * e, d * e - b * f, a * f - d * d, b * e - c * d, b * d - a * e, a * c - b * b
+    det = a * aa + b * bb + d * dd
+    x, y, z = rows[6], rows[7], rows[8]
+    out[0] = (aa * x + bb * y + dd * z) / det
+    out[1] = (bb * x + cc * y + ee * z) / det
+    out[2] = (dd * x + ee * y + ff * z) / det
+
+
+@numba.njit(cache=True, fastmath=True)
+def _weight(p, normal, r, surface):
+    """How much a point p (3) with its normal (3) is to be taken for what row r shows, 0..1."""
+    across, along = _off(p, r, surface)
+    cosine = np.float32(0)
     for k in range(3):
-        m[k] = turned * flow[k]
-        flow[k] = m[k] + turned * sign * more[k]
-    satisfy(surface.constraint[r, side], flow)
-    for k in range(3):
-        more[k] = turned * sign * (flow[k] - m[k])
+        cosine += normal[k] * surface.normal[r, k]
+    size = surface.pixel[r]
+    return np.exp(-((2 * across / size) ** 2) - (along / size) ** 2) * max(abs(cosine), np.float32(0.1)) ** 2
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -301,7 +332,7 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
     frames, direction = len(position), 2 * side - 1
     start, p, q = position[here].copy(), position[here].copy(), rotation[here].copy()
     flow, more, other, normal = np.empty(3, np.float32), np.empty(3, np.float32), p.copy(), np.empty(3, np.float32)
-    m, spin = np.empty(6, np.float32), np.empty(3, np.float32)
+    m, spin, rows = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(9, np.float32)
     confirmed, f = here, here
     size = np.float32(0)
     while 0 <= f + direction < frames:
@@ -312,25 +343,27 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
         for k in range(3):
             flow[k] *= direction
             spin[k] = direction * m[3 + k]
+        rows[:] = 0
         more[:] = 0
         tolerance = min(rules.tolerance + rules.drift * abs(f - confirmed), rules.most)
         for j in range(len(surface.frame)):
             if surface.frame[j] == f:
                 r = _seen_at(p, normal, j, tolerance, surface, rules)
                 if r >= 0:
-                    _learn(r, side, direction, interval, surface, field, m, other, more)
+                    w = _weight(p, normal, r, surface)
+                    _gather(p, r, w, side, direction, interval, surface, field, m, other, rows)
+        _solve(rows, rules.prior, more)
         _turned(q, spin)
         _normal(q, normal)
         tolerance = min(rules.tolerance + rules.drift * abs(g - confirmed), rules.most)
-        for j in range(len(surface.frame)):
-            if surface.frame[j] == g:
-                for k in range(3):
-                    p[k] = start[k] + flow[k] + more[k]
-                r = _seen_at(p, normal, j, tolerance, surface, rules)
-                if r >= 0:
-                    _learn(r, 1 - side, direction, interval, surface, field, m, other, more)
         for k in range(3):
             p[k] = start[k] + flow[k] + more[k]
+        for j in range(len(surface.frame)):
+            if surface.frame[j] == g:
+                r = _seen_at(p, normal, j, tolerance, surface, rules)
+                if r >= 0:
+                    w = _weight(p, normal, r, surface)
+                    _gather(p, r, w, 1 - side, direction, interval, surface, field, m, other, rows)
         other[:] = p
         seen = gone = False
         for j in range(len(surface.frame)):
@@ -340,7 +373,12 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
                     gone = True
                 elif r >= 0:
                     seen = True
-                    _put_right(p, q, normal, r, surface, rules)
+                    w = _weight(p, normal, r, surface)
+                    _gather_depth(p, r, rules.depth * w, more, surface, rows)
+                    _lean(q, normal, r, rules.turn * w, surface)
+        _solve(rows, rules.prior, more)
+        for k in range(3):
+            p[k] = start[k] + flow[k] + more[k]
         if gone or abs(g - confirmed) > rules.unseen:
             break
         position[g], rotation[g] = p, q
@@ -355,19 +393,28 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _put_right(p, q, normal, r, surface, rules):
-    """Moves p (3) to the surface that row r shows, and turns q (4) with its normal (3) some way to it."""
-    across, along = _off(p, r, surface)
-    size = surface.pixel[r]
-    part = max(1 - size / max(along, np.float32(1e-9)), np.float32(0))  # beyond the pixel's own reach: into it
-    cosine = np.float32(0)
+def _gather_depth(p, r, weight, more, surface, rows):
+    """Adds to rows (9), see `_gather`, that p (3), where `more` (3) brought it, is to be on the surface of row r."""
+    across, _ = _off(p, r, surface)
+    n = surface.normal[r]
+    b = -across
     for k in range(3):
-        p[k] -= across * surface.normal[r, k]
-        cosine += normal[k] * surface.normal[r, k]
-    sign = np.float32(1 if cosine > 0 else -1)
-    w = np.empty(3, np.float32)
+        b += n[k] * more[k]
+    q = 0
     for k in range(3):
-        p[k] += part * (surface.place[r, k] - p[k])
+        for i in range(k + 1):
+            rows[q] += weight * n[k] * n[i]
+            q += 1
+        rows[6 + k] += weight * n[k] * b
+
+
+@numba.njit(cache=True, fastmath=True)
+def _lean(q, normal, r, part, surface):
+    """Turns q (4), whose third axis is normal (3), by a part of the way to the normal of row r, or to its opposite."""
+    n, w, cosine = surface.normal[r], np.empty(3, np.float32), np.float32(0)
+    for k in range(3):
+        cosine += normal[k] * n[k]
+    for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
-        w[k] = rules.turn * sign * (normal[a] * surface.normal[r, b] - normal[b] * surface.normal[r, a])
+        w[k] = (part if cosine > 0 else -part) * (normal[a] * n[b] - normal[b] * n[a])
     _turned(q, w)
