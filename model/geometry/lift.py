@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,34 +52,18 @@ def lift_geometry(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Geom
     """Views with depth and flow -> Geometry with LIFT_FEATURES. CPU tensors (the kernel that follows points is
     compiled)."""
     step = views.frame_step
-    depth = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
-    valid = (views.alpha > MIN_ALPHA) & (depth > 0)
-    ray = camera_rays(views.intrinsics, *views.size)
-    pixel = depth / views.intrinsics[:, 0, None, None]  # a pixel's size at the surface
-    point = ray * depth[..., None]
-    slopes = [surface_slope(point, valid, pixel, axis)[valid] for axis in (2, 1)]
-
-    view = valid.nonzero()[:, 0]
-    R, ray, depth, pixel, point = views.c2w[view, :3, :3], ray[valid], depth[valid], pixel[valid], point[valid]
-    scale, axes = tangent_frame(*slopes, point, pixel, settings)
-    axes = R @ axes
-    normal = axes[..., 2]
-    place = (R @ point[..., None])[..., 0] + views.c2w[view, :3, 3]
-    to_next, to_previous = views.flow[valid].split(2, -1)
-    alpha = views.alpha[valid]
-    # Pixels that mix object and background say nothing about depth.
-    observed = torch.where(views.alpha < EMPTY_ALPHA, torch.inf, -1.0)
-    observed[valid] = depth
-    points = SurfacePoints(view, place, normal, pixel, to_next, to_previous, depth, ray[:, :2])
-    pieces, of, summary = track_points(views, points, observed)
+    seen = surface_seen(views, settings)
+    valid, points, alpha = seen.valid, seen.points, views.alpha[seen.valid]
+    view, normal, pixel, depth = points.view, points.normal, points.pixel, points.depth
+    pieces, of, summary = track_points(views, points, seen.observed)
 
     gaussians = Gaussians4D(
         xyz=pieces.place - settings.inset * (pixel[:, None] * normal)[of],
         t=pieces.time * step,
         velocity=pieces.velocity / step,
         sigma_t=(settings.lifetime * pieces.half_length).clamp_min(settings.min_sigma_t) * step,
-        scale=scale[of],
-        rotation=quaternion_from_matrix(axes)[of],
+        scale=seen.scale[of],
+        rotation=quaternion_from_matrix(seen.axes)[of],
         rgb=views.rgb[valid][of],
         opacity=(settings.opacity * alpha).clamp(1e-3, 0.99)[of],
     )
@@ -86,7 +71,7 @@ def lift_geometry(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Geom
     features = Features.build(
         LIFT_FEATURES,
         valid,
-        distance=scaled_distance(depth * ray.norm(dim=-1)),
+        distance=scaled_distance(depth * seen.ray.norm(dim=-1)),
         normal=normal,
         motion=SCALES.motion * nearest_in_time(of, away, pieces.velocity, len(view)) / step,
         frames_before=SCALES.count * summary.frames_before,
@@ -98,6 +83,39 @@ def lift_geometry(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Geom
     max_shift = torch.zeros_like(views.alpha)
     max_shift[valid] = 2 * pixel
     return Geometry(gaussians, valid.flatten().nonzero()[:, 0][of], max_shift, features)
+
+
+class Seen(NamedTuple):
+    """The surface that V views show in n pixels."""
+
+    valid: Tensor  # (V,H,W) bool, n of them
+    points: SurfacePoints
+    ray: Tensor  # (n,3) camera space, at planar z = 1
+    scale: Tensor  # (n,3) see `tangent_frame`
+    axes: Tensor  # (n,3,3) world
+    observed: Tensor  # (V,H,W) planar z, free space (inf), or unknown (-1)
+
+
+def surface_seen(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Seen:
+    """What views with depth and flow show. CPU tensors."""
+    depth = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
+    valid = (views.alpha > MIN_ALPHA) & (depth > 0)
+    ray = camera_rays(views.intrinsics, *views.size)
+    pixel = depth / views.intrinsics[:, 0, None, None]  # a pixel's size at the surface
+    point = ray * depth[..., None]
+    slopes = [surface_slope(point, valid, pixel, axis)[valid] for axis in (2, 1)]
+
+    view = valid.nonzero()[:, 0]
+    R, ray, depth, pixel, point = views.c2w[view, :3, :3], ray[valid], depth[valid], pixel[valid], point[valid]
+    scale, axes = tangent_frame(*slopes, point, pixel, settings)
+    axes = R @ axes
+    place = (R @ point[..., None])[..., 0] + views.c2w[view, :3, 3]
+    to_next, to_previous = views.flow[valid].split(2, -1)
+    # Pixels that mix object and background say nothing about depth.
+    observed = torch.where(views.alpha < EMPTY_ALPHA, torch.inf, -1.0)
+    observed[valid] = depth
+    points = SurfacePoints(view, place, axes[..., 2], pixel, to_next, to_previous, depth, ray[:, :2])
+    return Seen(valid, points, ray, scale, axes, observed)
 
 
 def nearest_in_time(of: Tensor, away: Tensor, values: Tensor, n: int) -> Tensor:

@@ -71,7 +71,7 @@ class _PointArrays(NamedTuple):
     place: np.ndarray  # (n,3)
     normal: np.ndarray  # (n,3)
     pixel: np.ndarray  # (n,)
-    constraint: np.ndarray  # (n,2,8) see `_satisfy`: of the motion to the previous frame, and to the next
+    constraint: np.ndarray  # (n,2,8) see `satisfy`: of the motion to the previous frame, and to the next
 
 
 class _ViewArrays(NamedTuple):
@@ -91,13 +91,10 @@ def track_points(
     comparison: planar z, free space (inf), or unknown (-1). CPU tensors."""
     frame = views.time / views.frame_step
     last = 1 / views.frame_step if views.frame_step < 2 else 0.0
-    intervals = max(round(2 * last), 1)
-    A, next_b, previous_b = constraints(views, points)
-    field = scene_flow(views, points, A, next_b, previous_b, intervals)
-    constraint = torch.stack([torch.cat([A.flatten(1), b], -1) for b in (previous_b, next_b)], 1)
+    field, constraint = known_motion(views, points)
     own = _PointArrays(points.view.numpy(), *map(_float32, (points.place, points.normal, points.pixel, constraint)))
     cameras = (frame, views.c2w[:, :3, 3], torch.linalg.inv(views.c2w), views.intrinsics, observed)
-    known = (own, _ViewArrays(*map(_float32, cameras)), field.numpy(), np.float32(-last), np.float32(last))
+    known = (own, _ViewArrays(*map(_float32, cameras)), field, np.float32(-last), np.float32(last))
     n = len(points.view)
     pieces = Pieces(*(np.zeros((n, MAX_PIECES, *tail), np.float32) for tail in ((), (), (3,), (3,))))
     count, summary = np.zeros(n, np.int64), TrackSummary(*np.zeros((4, n), np.float32))
@@ -110,6 +107,15 @@ def track_points(
         torch.from_numpy(point),
         TrackSummary(*map(torch.from_numpy, summary)),
     )
+
+
+def known_motion(views: Views, points: SurfacePoints) -> tuple[np.ndarray, Tensor]:
+    """The scene flow (intervals,G,G,G,6), and what the points' own pixels say (n,2,8) as `satisfy` takes it: of the
+    motion to the previous frame, and to the next."""
+    last = 1 / views.frame_step if views.frame_step < 2 else 0.0
+    A, next_b, previous_b = constraints(views, points)
+    field = scene_flow(views, points, A, next_b, previous_b, max(round(2 * last), 1))
+    return field.numpy(), torch.stack([torch.cat([A.flatten(1), b], -1) for b in (previous_b, next_b)], 1)
 
 
 def _float32(x: Tensor) -> np.ndarray:
@@ -133,8 +139,8 @@ def _depth_error(x, y, z, j, w2c, K, observed, tolerance):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _flow_at(field, interval, p, out):
-    """Trilinear value of the scene flow at p (3)."""
+def flow_at(field, interval, p, m, out):
+    """Trilinear value of the scene flow at p (3): its v and ω to m (6), the motion v + ω x p to out (3)."""
     grid = field.shape[1]
     base = np.empty(3, np.int64)
     part = np.empty(3, np.float32)
@@ -142,7 +148,7 @@ def _flow_at(field, interval, p, out):
         g = min(max((p[k] / EXTENT + 1) * 0.5 * grid - 0.5, 0.0), grid - 1.001)
         base[k] = int(g)
         part[k] = g - base[k]
-    m = np.zeros(6, np.float32)
+    m[:] = 0
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
         w = (part[0] if a else 1 - part[0]) * (part[1] if b else 1 - part[1]) * (part[2] if c else 1 - part[2])
@@ -163,7 +169,7 @@ def _tracks(begin, end, points, views, field, start, last, settings, pieces, cou
     steps = int(settings.max_frames)
     for i in range(begin, end):
         path = np.zeros((2 * steps + 1, 3), np.float32)  # places at own frame - steps … + steps
-        p, flow = np.empty(3, np.float32), np.empty(3, np.float32)
+        p, flow, m = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(6, np.float32)
         reach = np.zeros(2, np.float32)
         here = frame[view[i]]
         path[steps] = world[i]
@@ -178,11 +184,11 @@ def _tracks(begin, end, points, views, field, start, last, settings, pieces, cou
                     break
                 interval = round((now if direction < 0 else now - 1) - start)
                 interval = min(max(interval, 0), len(field) - 1)
-                _flow_at(field, interval, p, flow)
+                flow_at(field, interval, p, m, flow)
                 for k in range(3):
                     flow[k] *= direction
                 if s == 1:  # the pixel's own motion vector is exact: two of three components are known
-                    _satisfy(points.constraint[i, side], flow)
+                    satisfy(points.constraint[i, side], flow)
                 for k in range(3):
                     p[k] += flow[k]
                 taken = gone = False
@@ -227,7 +233,7 @@ def _tracks(begin, end, points, views, field, start, last, settings, pieces, cou
 
 
 @numba.njit(cache=True, fastmath=True)
-def _satisfy(row, flow):
+def satisfy(row, flow):
     """Moves flow (3) by the least amount such that A·flow = b holds; row (8): A (2,3) row by row, then b (2). (Written
     so that its bits do not depend on whether it was compiled now or comes from numba's cache.)"""
     aa = row[0] ** 2 + row[1] ** 2 + row[2] ** 2
