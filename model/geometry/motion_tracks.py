@@ -48,7 +48,9 @@ class MotionSettings(NamedTuple):
     drift: float = 0.3  # … this for each frame since it was last seen, …
     most: float = 3.0  # … up to this
     steepest: float = 0.2  # cosine: pixels that see the surface under less start no points
-    unseen: int = 24  # frames that a point is followed without being seen
+    doubt: float = 0.25  # share of a step that it may be wrong by, where no view sees the point, …
+    doubt_seen: float = 0.06  # … and where one does; …
+    most_doubt: float = 1.5  # … a point is followed as long as the sum is below this
     prior: float = 0.03  # weight of the scene flow against what motion vectors say of a point's own step
     depth: float = 4.0  # weight of the depth of what is seen, as a multiple of that of its motion
     turn: float = 0.3  # share by which a normal that is seen turns the point's
@@ -75,13 +77,14 @@ def motion_tracks(views: Views, known: SurfaceTracks | None = None, settings: Mo
     rules = single(settings)
     there = [] if known is None else [_Points(known.position, known.rotation, known.first, known.last, known.area)]
     found: list[_Points] = []
+    pixel = np.float32(np.median(surface.pixel))
     for f in _order(frames):
         new = _sown(surface, f, frames, [*there, *found], rules)
         jobs = chunks(len(new.first), 1024)
-        parallel_for(jobs, lambda a, b, new=new, f=f: _follow(a, b, f, surface, field, rules, *new[:4]))
+        parallel_for(jobs, lambda a, b, new=new, f=f: _follow(a, b, f, pixel, surface, field, rules, *new[:4]))
         found.append(new)
     points = _Points(*map(np.concatenate, zip(*found, strict=True)))
-    relax(points, float(np.median(surface.pixel)), surface, field)
+    relax(points, pixel, surface, field)
     return SurfaceTracks(
         points.position,
         points.rotation.astype(np.float16),
@@ -164,12 +167,12 @@ def _thinned(pixels, j, surface, explained, rules):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _follow(begin, end, here, surface, field, rules, position, rotation, first, last):
+def _follow(begin, end, here, size, surface, field, rules, position, rotation, first, last):
     """Follows the points begin…end from frame `here` both ways."""
     frames = position.shape[1]
     for i in range(begin, end):
         for side in range(2):
-            f = _follow_one(here, side, surface, field, rules, position[i], rotation[i])
+            f = _follow_one(here, side, size, surface, field, rules, position[i], rotation[i])
             if side:
                 last[i] = f
             else:
@@ -179,14 +182,14 @@ def _follow(begin, end, here, surface, field, rules, position, rotation, first, 
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _follow_one(here, side, surface, field, rules, position, rotation):
+def _follow_one(here, side, size, surface, field, rules, position, rotation):
     """Follows a point with position (F,3) and rotation (F,4) from frame `here` on, to later ones (side 1) or earlier
     ones (0) -> the frame at which it is there last."""
     frames, direction = len(position), 2 * side - 1
     start, p, q = position[here].copy(), position[here].copy(), rotation[here].copy()
     flow, more, other, normal = np.empty(3, np.float32), np.empty(3, np.float32), p.copy(), np.empty(3, np.float32)
     m, spin, rows = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(9, np.float32)
-    confirmed, f = here, here
+    confirmed, f, doubt = here, here, np.float32(0)
     while 0 <= f + direction < frames:
         g, interval = f + direction, (f if side else f - 1)
         start[:] = p
@@ -231,7 +234,13 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
         solve(rows, rules.prior, more)
         for k in range(3):
             p[k] = start[k] + flow[k] + more[k]
-        if gone or abs(g - confirmed) > rules.unseen:
+        if gone:
+            break
+        square = np.float32(0)
+        for k in range(3):
+            square += (p[k] - start[k]) ** 2
+        doubt += (rules.doubt_seen if rows[0] + rows[2] + rows[5] > 0.5 else rules.doubt) * np.sqrt(square) / size
+        if doubt > rules.most_doubt:
             break
         position[g], rotation[g] = p, q
         if seen:
