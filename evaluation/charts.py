@@ -26,7 +26,15 @@ from .labels import plain, settle
 from .metrics import METRICS
 
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, BLACK, GREY = COLOURS
-FAMILIES = {"tracks": BLACK, "lift": GREY, "guided": BLUE, "rgb": ORANGE, "sweep": ORANGE, "predicted": PINK, "gs-lrm-all": YELLOW}
+FAMILIES = {
+    "tracks": BLACK,
+    "lift": GREY,
+    "guided": BLUE,
+    "rgb": ORANGE,
+    "sweep": ORANGE,
+    "predicted": PINK,
+    "gs-lrm-all": YELLOW,
+}
 FAMILIES |= {"gs-lrm-frame": YELLOW, "hull": GREY, "white": GREY, "4dgs": GREEN, "som": SKY}
 SEES = {True: "depth + motion", False: "RGB alone"}
 NAMES = {"seconds": "seconds of one thread", "gaussians": "Gaussians", "ply_mb": "megabytes of the .ply"}

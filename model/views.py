@@ -28,6 +28,7 @@ class Views:
     depth: Tensor | None = None  # (V,H,W) planar z, inf where there is no surface
     flow: Tensor | None = None  # (V,H,W,4) pixels to the next frame (x, y) and to the previous one (x, y)
     surface: SurfaceTracks | None = None  # points of the surface, followed by the renderer through the whole clip
+    untracked: bool = False  # whether something that is seen has none of them
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -69,6 +70,7 @@ def load_views(seq: Sequence, indices, has_depth: bool = False) -> Views:
         views.depth = torch.from_numpy(np.stack([x.depth for x in p]))
         views.flow = torch.from_numpy(np.stack([np.concatenate([x.flow_next, x.flow_prev], -1) for x in p]))
         views.surface = seq.load_tracks() if seq.tracks else None
+        views.untracked = bool(seq.untracked)
     return views
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 
 from ...datagen.sequence import InputError
 from ...datagen.track_file import SurfaceTracks
+from ..geometry.motion_tracks import motion_tracks
 from ..geometry.surface_tracks import needed_points, pixel_size, surface_tracks
 from ..tracks import Tracks4D
 from ..views import Views
@@ -59,10 +61,19 @@ def reconstruct_tracks(
 
 
 def followed(views: Views) -> SurfaceTracks:
-    """The points that are followed through the clip. Raises InputError where there are none."""
-    if views.surface is None or not len(views.surface):
-        raise InputError("The views have no surface tracks; render them with --tracks auto, or take another method.")
-    return views.surface
+    """The points that are followed through the clip: by the renderer, and by motion vectors where it followed nothing or
+    not all. Raises InputError where nothing can be followed."""
+    known = views.surface if views.surface is not None and len(views.surface) else None
+    if known is not None and not views.untracked:
+        return known
+    if views.depth is None or views.flow is None:
+        raise InputError("The views have neither surface tracks nor depth and motion vectors; render them with passes.")
+    more = motion_tracks(views, known)
+    if known is None:
+        return more
+    both = {k: np.concatenate([getattr(known, k), getattr(more, k)]) for k in vars(known)}
+    order = np.random.default_rng(0).permutation(len(known) + len(more))  # so that any part of them is of both
+    return SurfaceTracks(**{k: a[order] for k, a in both.items()})
 
 
 def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None) -> int:

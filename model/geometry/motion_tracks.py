@@ -35,6 +35,7 @@ from .surface_evidence import (
     turn,
     weight_of,
 )
+from .track_windows import fill_gaps
 from .tracking import flow_at
 
 
@@ -48,7 +49,10 @@ class MotionSettings(NamedTuple):
     drift: float = 0.3  # … this for each frame since it was last seen, …
     most: float = 3.0  # … up to this
     steepest: float = 0.2  # cosine: pixels that see the surface under less start no points
-    unseen: int = 24  # frames that a point is followed without being seen
+    doubt: float = 0.25  # share of a step that it may be wrong by, where no view sees the point, …
+    doubt_seen: float = 0.06  # … and where one does; …
+    sure: float = 1.5  # … as long as the sum is below this it is sure where the point is …
+    gap: float = 1.2  # … and beyond where there is no other point so near
     prior: float = 0.03  # weight of the scene flow against what motion vectors say of a point's own step
     depth: float = 4.0  # weight of the depth of what is seen, as a multiple of that of its motion
     turn: float = 0.3  # share by which a normal that is seen turns the point's
@@ -62,8 +66,8 @@ class _Points(NamedTuple):
 
     position: np.ndarray  # (N,F,3)
     rotation: np.ndarray  # (N,F,4)
-    first: np.ndarray  # (N,)
-    last: np.ndarray  # (N,)
+    most: np.ndarray  # (N,2) first and last frame to which each was followed
+    sure: np.ndarray  # (N,2) the same, of frames at which it is sure where it is
     area: np.ndarray  # (N,)
 
 
@@ -73,20 +77,26 @@ def motion_tracks(views: Views, known: SurfaceTracks | None = None, settings: Mo
     frames = 1 if views.frame_step == 2 and not views.time.any() else round(2 / views.frame_step) + 1
     surface, field = surface_of(views)
     rules = single(settings)
-    there = [] if known is None else [_Points(known.position, known.rotation, known.first, known.last, known.area)]
+    there: list[_Points] = []
+    if known is not None:
+        window = np.stack([known.first, known.last], 1).astype(np.int64)
+        there = [_Points(known.position, known.rotation, window, window, known.area)]
     found: list[_Points] = []
+    pixel = np.float32(np.median(surface.pixel))
     for f in _order(frames):
         new = _sown(surface, f, frames, [*there, *found], rules)
-        jobs = chunks(len(new.first), 1024)
-        parallel_for(jobs, lambda a, b, new=new, f=f: _follow(a, b, f, surface, field, rules, *new[:4]))
+        jobs = chunks(len(new.area), 1024)
+        parallel_for(jobs, lambda a, b, new=new, f=f: _follow(a, b, f, pixel, surface, field, rules, *new[:4]))
         found.append(new)
     points = _Points(*map(np.concatenate, zip(*found, strict=True)))
-    relax(points, float(np.median(surface.pixel)), surface, field)
+    relax(points.position, points.rotation, points.most, pixel, surface, field)
+    fill_gaps(points.position, points.sure, points.most, rules.gap * pixel)
+    frame = np.arange(frames)[None].clip(points.sure[:, :1], points.sure[:, 1:])[..., None]
     return SurfaceTracks(
-        points.position,
-        points.rotation.astype(np.float16),
-        points.first.astype(np.int32),
-        points.last.astype(np.int32),
+        np.take_along_axis(points.position, frame, 1),
+        np.take_along_axis(points.rotation, frame, 1).astype(np.float16),
+        points.sure[:, 0].astype(np.int32),
+        points.sure[:, 1].astype(np.int32),
         points.area,
     )
 
@@ -109,7 +119,7 @@ def _sown(surface: Surface, f: int, frames: int, points: list[_Points], rules: M
     for v in np.flatnonzero(surface.frame == f):
         explained = np.zeros(surface.row.shape[1:], np.bool_)
         for p in points:
-            alive = (p.first <= f) & (f <= p.last)
+            alive = (p.sure[:, 0] <= f) & (f <= p.sure[:, 1])
             _explain(p.position[alive, f], v, surface, explained, rules.near, rules.deep)
         for rows in started:
             _explain(surface.place[rows], v, surface, explained, rules.near, rules.deep)
@@ -119,7 +129,7 @@ def _sown(surface: Surface, f: int, frames: int, points: list[_Points], rules: M
     n = len(rows)
     position, rotation = np.zeros((n, frames, 3), np.float32), np.zeros((n, frames, 4), np.float32)
     position[:], rotation[:] = surface.place[rows, None], surface.turn[rows, None]
-    when = np.full(n, f)
+    when = np.full((n, 2), f)
     return _Points(position, rotation, when, when.copy(), (rules.apart * surface.pixel[rows]) ** 2 * np.float32(1.4))
 
 
@@ -164,29 +174,24 @@ def _thinned(pixels, j, surface, explained, rules):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _follow(begin, end, here, surface, field, rules, position, rotation, first, last):
+def _follow(begin, end, here, size, surface, field, rules, position, rotation, most, sure):
     """Follows the points begin…end from frame `here` both ways."""
-    frames = position.shape[1]
     for i in range(begin, end):
         for side in range(2):
-            f = _follow_one(here, side, surface, field, rules, position[i], rotation[i])
-            if side:
-                last[i] = f
-            else:
-                first[i] = f
-            for g in range(f + 1, frames) if side else range(f):
-                position[i, g], rotation[i, g] = position[i, f], rotation[i, f]
+            most[i, side], sure[i, side] = _follow_one(
+                here, side, size, surface, field, rules, position[i], rotation[i]
+            )
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _follow_one(here, side, surface, field, rules, position, rotation):
+def _follow_one(here, side, size, surface, field, rules, position, rotation):
     """Follows a point with position (F,3) and rotation (F,4) from frame `here` on, to later ones (side 1) or earlier
-    ones (0) -> the frame at which it is there last."""
+    ones (0) -> the last frame that it comes to, and the last at which it is sure where it is."""
     frames, direction = len(position), 2 * side - 1
     start, p, q = position[here].copy(), position[here].copy(), rotation[here].copy()
     flow, more, other, normal = np.empty(3, np.float32), np.empty(3, np.float32), p.copy(), np.empty(3, np.float32)
     m, spin, rows = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(9, np.float32)
-    confirmed, f = here, here
+    confirmed, f, sure, doubt = here, here, here, np.float32(0)
     while 0 <= f + direction < frames:
         g, interval = f + direction, (f if side else f - 1)
         start[:] = p
@@ -231,8 +236,14 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
         solve(rows, rules.prior, more)
         for k in range(3):
             p[k] = start[k] + flow[k] + more[k]
-        if gone or abs(g - confirmed) > rules.unseen:
+        if gone:
             break
+        square = np.float32(0)
+        for k in range(3):
+            square += (p[k] - start[k]) ** 2
+        doubt += (rules.doubt_seen if rows[0] + rows[2] + rows[5] > 0.5 else rules.doubt) * np.sqrt(square) / size
+        if doubt < rules.sure:
+            sure = g
         position[g], rotation[g] = p, q
         if seen:
             for h in range(confirmed + direction, g, direction):  # what was wrong became so little by little
@@ -241,4 +252,4 @@ def _follow_one(here, side, surface, field, rules, position, rotation):
                     position[h, k] += part * (p[k] - other[k])
             confirmed = g
         f = g
-    return f
+    return f, sure

@@ -46,8 +46,7 @@ class _State(NamedTuple):
 
     position: np.ndarray  # (N,F,3)
     rotation: np.ndarray  # (N,F,4)
-    first: np.ndarray  # (N,)
-    last: np.ndarray  # (N,)
+    window: np.ndarray  # (N,2) first and last frame
     near: np.ndarray  # (N,K) neighbours, -1 where there are fewer
     shape: np.ndarray  # (N,K,3) where they are in the point's own frame of reference
     weight: np.ndarray  # (N,K)
@@ -56,14 +55,22 @@ class _State(NamedTuple):
     motion: np.ndarray  # (N,F,9) normal equations of the motion to the next frame
 
 
-def relax(points, pixel: float, surface: Surface, field: np.ndarray, settings: RelaxSettings = RELAX) -> None:
-    """Puts the points right, in place: position (N,F,3), rotation (N,F,4), first and last (N,)."""
-    n, frames = points.position.shape[:2]
+def relax(
+    position: np.ndarray,
+    rotation: np.ndarray,
+    window: np.ndarray,
+    pixel: float,
+    surface: Surface,
+    field: np.ndarray,
+    settings: RelaxSettings = RELAX,
+) -> None:
+    """Puts the points right, in place: position (N,F,3), rotation (N,F,4); window (N,2): their first and last frame."""
+    n, frames = position.shape[:2]
     if n < 2 or frames < 2:
         return
-    near = _neighbours(points, settings.reach * pixel)
+    near = _neighbours(position, window, settings.reach * pixel)
     sizes = ((n, NEIGHBOURS, 3), (n, NEIGHBOURS), (n, frames), (n, frames, 9), (n, frames, 9))
-    state = _State(*points[:4], near, *(np.zeros(s, np.float32) for s in sizes))
+    state = _State(position, rotation, window, near, *(np.zeros(s, np.float32) for s in sizes))
     rules, size = single(settings), np.float32(pixel)
     jobs = chunks(n, 1024)
     for k in range(settings.rounds):
@@ -76,19 +83,19 @@ def relax(points, pixel: float, surface: Surface, field: np.ndarray, settings: R
                 parallel_for([(t,) for t in range(odd, frames, 2)], lambda t: _sweep(t, state, rules))
 
 
-def _neighbours(points, reach: float) -> np.ndarray:
+def _neighbours(position: np.ndarray, window: np.ndarray, reach: float) -> np.ndarray:
     """(N,K) some points that are within `reach` at a frame at which both are there, -1 where there are fewer."""
-    n = len(points.first)
+    n = len(window)
     near = np.full((n, NEIGHBOURS), -1, np.int64)
-    middle = (points.first + points.last) // 2
+    middle = window.sum(1) // 2
     random = np.random.default_rng(0)
     for f in np.unique(middle):
-        alive = random.permutation(np.flatnonzero((points.first <= f) & (f <= points.last)))
-        cell = np.floor(points.position[alive, f] / reach).astype(np.int64) + 512
+        alive = random.permutation(np.flatnonzero((window[:, 0] <= f) & (f <= window[:, 1])))
+        cell = np.floor(position[alive, f] / reach).astype(np.int64) + 512
         key = (cell[:, 0] * 1024 + cell[:, 1]) * 1024 + cell[:, 2]
         order = np.argsort(key, kind="stable")
         mine = np.flatnonzero(middle == f)
-        _find(mine, points.position[:, f], np.float32(reach), alive[order], key[order], near)
+        _find(mine, position[:, f], np.float32(reach), alive[order], key[order], near)
     return near
 
 
@@ -128,7 +135,7 @@ def _ask(begin, end, tolerance, state, surface, field, rules):
     for i in range(begin, end):
         depth, motion, seen = state.depth[i], state.motion[i], state.seen[i]
         depth[:], motion[:], seen[:] = 0, 0, 0
-        for t in range(state.first[i], state.last[i] + 1):
+        for t in range(state.window[i, 0], state.window[i, 1] + 1):
             p = state.position[i, t]
             third_axis(state.rotation[i, t], normal)
             for j in range(len(surface.frame)):
@@ -144,7 +151,7 @@ def _ask(begin, end, tolerance, state, surface, field, rules):
                     gather(p, r, w, 1, np.float32(1), t, surface, field, m, other, motion[t])
                 if t > 0:
                     gather(p, r, w, 0, np.float32(1), t - 1, surface, field, m, other, motion[t - 1])
-        for t in range(state.first[i], min(state.last[i], frames - 2) + 1):
+        for t in range(state.window[i, 0], min(state.window[i, 1], frames - 2) + 1):
             flow_at(field, t, state.position[i, t], m, flow)
             a = motion[t]
             a[0] += rules.prior
@@ -179,7 +186,9 @@ def _shapes(begin, end, pixel, state, rules):
                 continue
             total, square = np.float32(0), np.float32(0)
             mean = np.zeros(3, np.float32)
-            for t in range(max(state.first[i], state.first[j]), min(state.last[i], state.last[j]) + 1):
+            for t in range(
+                max(state.window[i, 0], state.window[j, 0]), min(state.window[i, 1], state.window[j, 1]) + 1
+            ):
                 trust = state.seen[i, t] * state.seen[j, t] + rules.unseen
                 for c in range(3):
                     away[c] = state.position[j, t, c] - state.position[i, t, c]
@@ -195,12 +204,12 @@ def _shapes(begin, end, pixel, state, rules):
                     square -= total * mean[c] ** 2
                 loose = max(square, np.float32(0)) / total / (rules.loose * pixel) ** 2
                 state.weight[i, k] = 1 / (1 + loose) ** 2
-        for t in range(state.first[i], state.last[i] + 1):
+        for t in range(state.window[i, 0], state.window[i, 1] + 1):
             rows[:] = 0
             size = np.float32(0)
             for k in range(state.near.shape[1]):
                 j, much = state.near[i, k], state.weight[i, k]
-                if j < 0 or t < state.first[j] or t > state.last[j]:
+                if j < 0 or t < state.window[j, 0] or t > state.window[j, 1]:
                     continue
                 _rotate(state.rotation[i, t], state.shape[i, k], np.float32(1), local)
                 for c in range(3):
@@ -226,13 +235,13 @@ def _sweep(t, state, rules):
     """Puts the places of frame t right, one point after the other."""
     frames = state.position.shape[1]
     rows, out, a = np.empty(9, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-    for i in range(len(state.first)):
-        if t < state.first[i] or t > state.last[i]:
+    for i in range(len(state.window)):
+        if t < state.window[i, 0] or t > state.window[i, 1]:
             continue
         rows[:] = state.depth[i, t]
         for side in range(2):
             g = t + 2 * side - 1
-            if g < state.first[i] or g > state.last[i] or g < 0 or g >= frames:
+            if g < state.window[i, 0] or g > state.window[i, 1] or g < 0 or g >= frames:
                 continue
             step, sign = state.motion[i, min(t, g)], np.float32(1 - 2 * side)
             p = state.position[i, g]
@@ -244,7 +253,7 @@ def _sweep(t, state, rules):
         rigid = np.float32(0)
         for k in range(state.near.shape[1]):
             j = state.near[i, k]
-            if j < 0 or t < state.first[j] or t > state.last[j]:
+            if j < 0 or t < state.window[j, 0] or t > state.window[j, 1]:
                 continue
             much = rules.rigid * state.weight[i, k]
             # The neighbour's turn and the point's own: both say where it is from there.

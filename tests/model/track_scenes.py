@@ -81,16 +81,29 @@ def _points(normal: torch.Tensor) -> Tracks4D:
     return tracks
 
 
-def views(count: int = 18, seed: int = 0, scene: Tracks4D | None = None, elevation: float = 50) -> Views:
-    """Random views of the ball (or of another scene), one a moment in turn, with depth; no motion vectors."""
-    scene, rng = scene or ball(), np.random.default_rng(seed)
+def views(count: int = 18, seed: int = 0, elevation: float = 50) -> Views:
+    """Random views of the ball, one a moment in turn, with depth; no motion vectors."""
+    rng = np.random.default_rng(seed)
     poses = [spherical(rng.uniform(0, 360), rng.uniform(-elevation, elevation)) for _ in range(count)]
     c2w = torch.from_numpy(opengl_to_opencv(np.stack(poses))).float()
     intrinsics = torch.tensor([[FOCAL, FOCAL, SIZE / 2, SIZE / 2]]).expand(count, 4).clone()
-    time = (torch.arange(count) % FRAMES) * 2 / (FRAMES - 1) - 1
+    return shoot(c2w, intrinsics, (torch.arange(count) % FRAMES) * 2 / (FRAMES - 1) - 1)
+
+
+def views_at(seen: Views, frame: int = 4) -> Views:
+    """The same cameras, all at one frame, of a ball that stands still there for the whole clip."""
+    place, turn = motion()
+    still = ball()
+    still.paths = Paths(still.paths.start, still.paths.end, torch.tensor([1]), place[frame, None], turn[frame, None])
+    return shoot(seen.c2w, seen.intrinsics, seen.time, still)
+
+
+def shoot(c2w, intrinsics, time, scene: Tracks4D | None = None) -> Views:
+    """What cameras see of the ball, or of another one."""
+    scene = scene or ball()
     rgb, alpha = render(scene, c2w, intrinsics, time, SIZE, SIZE, background=0.0)
     depth = torch.full_like(alpha, torch.inf)
-    for v in range(count):  # the ball's own, exactly
+    for v in range(len(time)):  # the ball's own, exactly
         centre, _ = scene.paths.at(float(time[v]))
         ray = _rays(c2w[v])
         away = c2w[v, :3, 3] - centre[0]

@@ -3,17 +3,18 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from tests.model import track_scenes as scenes
 from timesplat.datagen.sequence import InputError
-from timesplat.model.fitting.track_views import fewest, reconstruct_tracks
+from timesplat.datagen.track_file import SurfaceTracks
+from timesplat.model.fitting.track_views import fewest, followed, reconstruct_tracks
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.io.asset import Clip, check
 from timesplat.model.io.ply import read_ply, write_ply
 from timesplat.model.methods import ReconstructOptions
-from timesplat.model.rasterize import render
 from timesplat.model.reconstruct import reconstruct_views
 from timesplat.model.tracks import Tracks4D
 
@@ -44,9 +45,28 @@ def test_the_fewest_are_as_good_as_twice_as_many(monkeypatch):
         fewest(seen.surface, seen, 0.0)
 
 
-def test_without_points_one_sentence():
-    with pytest.raises(InputError, match="--tracks auto"):
-        reconstruct_tracks(replace(scenes.views(3), surface=None), 1.0)
+def test_without_anything_to_follow_one_sentence():
+    with pytest.raises(InputError, match="neither surface tracks nor depth"):
+        reconstruct_tracks(replace(scenes.views(3), surface=None, flow=None), 1.0)
+
+
+def test_motion_vectors_lead_where_the_renderer_followed_nothing_or_not_all():
+    """A still moment, so that no motion is the right one. Half of the ball is known, the lower one."""
+    seen, others = scenes.views(18), scenes.views(9, seed=5)
+    still, truth = scenes.views_at(seen), scenes.views_at(others)
+    lone = followed(replace(still, surface=None))
+    assert len(lone) > 200
+    known = scenes.surface()
+    stands = {k: np.repeat(getattr(known, k)[:, 4:5], scenes.FRAMES, 1) for k in ("position", "rotation")}
+    lower = known.position[:, 4, 2] < known.position[:, 4, 2].mean()
+    half = SurfaceTracks(**{k: a[lower] for k, a in (vars(known) | stands).items()})
+    assert len(followed(replace(still, surface=half))) == lower.sum()
+    both = followed(replace(still, surface=half, untracked=True))
+    assert lower.sum() + 50 < len(both) < lower.sum() + len(lone)
+    tracks = reconstruct_tracks(replace(still, surface=half, untracked=True), 0.0, steps=40)
+    assert scenes.psnr(tracks, truth) > scenes.psnr(
+        reconstruct_tracks(replace(still, surface=half), 0.0, steps=40), truth
+    )
 
 
 def test_through_the_file(tmp_path):
@@ -71,7 +91,4 @@ def test_straight_pieces_look_the_same():
 
 
 def _at(views):
-
-    scene = scenes.ball()
-    rgb, alpha = render(scene, views.c2w, views.intrinsics, views.time, scenes.SIZE, scenes.SIZE, background=0.0)
-    return replace(views, rgb=rgb / alpha.clamp_min(1e-4)[..., None], alpha=alpha)
+    return scenes.shoot(views.c2w, views.intrinsics, views.time)
