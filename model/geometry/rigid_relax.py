@@ -2,9 +2,9 @@
 """Points that were followed, put right by one another: what is near keeps its shape, nearly, from frame to frame.
 
 Where a point is unseen, others of its part are seen, and it is itself at other frames. All that is known is one sum of
-squares: the depth and the motion vectors that the views show of a point, the scene flow, and that a point is where each of
-its neighbours, turned as it is at that frame, says (as rigid as possible: Sorkine and Alexa 2007). It is made less by
-going over the points' turns and places in turn.
+squares: the depth and the motion vectors that the views show of a point, the scene flow, and that a point is where
+each of its neighbours, turned as it is at that frame, says (as rigid as possible: Sorkine and Alexa 2007). It is made
+less by going over the points' turns and places in turn.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _neighbours(position: np.ndarray, window: np.ndarray, reach: float) -> np.nd
 
 @numba.njit(cache=True, nogil=True)
 def _find(mine, place, reach, among, key, near):
-    """Writes to near (N,K) neighbours of the points `mine` of `among` (m,), which are sorted by their cells' key (m,)."""
+    """Writes to near (N,K) neighbours of the points `mine` of `among` (m,), sorted by their cells' key (m,)."""
     far = np.empty(near.shape[1], np.float32)
     for i in mine:
         count = 0

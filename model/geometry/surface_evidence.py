@@ -112,9 +112,9 @@ def seen_at(p, normal, j, tolerance, surface):
 
 @numba.njit(cache=True, fastmath=True)
 def gather(p, r, weight, side, sign, interval, surface, field, m, flow, rows):
-    """Adds to rows (9), the lower triangle of the normal equations of what the scene flow lacks at p (3) and their right
-    side, what the motion vector of row r says, to the next frame (side 1) or the previous one (0); sign: 1 if they are
-    of a motion to the next frame, -1 to the previous. m (6) and flow (3) are written over."""
+    """Adds to rows (9), the lower triangle of the normal equations of what the scene flow lacks at p (3) and their
+    right side, what the motion vector of row r says, to the next frame (side 1) or the previous one (0); sign: 1 if
+    they are of a motion to the next frame, -1 to the previous. m (6) and flow (3) are written over."""
     turned = np.float32(2 * side - 1)  # the way of the motion vector
     flow_at(field, interval, surface.place[r], m, flow)
     A = surface.constraint[r, side]
