@@ -2,7 +2,7 @@
 """The extension on Blender's command line, for scenes that are .blend files:
 
     blender -b scene.blend --command timesplat render --out data/scene --rig default
-    blender -b scene.blend --command timesplat reconstruct --method guided --output scene.ply --blend result.blend
+    blender -b scene.blend --command timesplat reconstruct --method tracks --output scene.ply --blend result.blend
 
 `--help` after either explains it. Exit code 2 and one sentence where the input cannot be used.
 """
@@ -35,7 +35,7 @@ def main(argv: list[str]) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="render | reconstruct")
     chosen = bpy.context.scene.timesplat
     for name, text in (
-        ("render", "cameras x frames to a Sequence: posed images, depth, motion"),
+        ("render", "cameras x frames to a Sequence: posed images, depth, motion, tracks of the surface"),
         ("reconstruct", "the object as 4D Gaussians, into the scene, a .ply or a new .blend"),
     ):
         sub = commands.add_parser(name, help=text, description=text)

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 from .settings import cameras, frames
 
-# Gaussians a pixel of the pictures: the mean of 12 objects, until one was made here
-_gaussians_a_pixel = {"guided": 0.19, "lift": 0.19, "rgb": 0.11}
+# Gaussians a pixel that counts (`_pixels_that_count`): the mean of 12 objects (tracks: 7), until one was made here
+_gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "rgb": 0.11}
+TRACKED = (4000, 100_000)  # fewest and most points that are followed
 START_SECONDS = 3.0  # of a process
 FIT_SECONDS = 5.0  # of a budget's own fit, of pictures of USUAL_PIXELS
 USUAL_PIXELS = 128**2  # of a picture
 USUAL_GAUSSIANS = 4000  # that a fit of pictures of USUAL_PIXELS uses at most, and in proportion to their sides
-SECONDS_A_PIXEL = {"guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
+SECONDS_A_PIXEL = {"tracks": 1e-6, "guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
 _seconds_a_sample = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
 
 
@@ -33,9 +34,15 @@ def estimate(settings, context) -> Estimate:
     placed, _ = cameras(context)
     n *= 1 if settings.in_turn or not placed else len(placed)
     pixels = n * settings.size**2
-    predicted = _gaussians_a_pixel[settings.method] * pixels
-    fit = settings.refine or (FIT_SECONDS * max(settings.size**2 / USUAL_PIXELS, 1) if settings.budget != "ALL" else 0)
-    most = USUAL_GAUSSIANS * settings.size / USUAL_PIXELS**0.5 if fit else predicted
+    predicted = _gaussians_a_pixel[settings.method] * _pixels_that_count(settings.method, n, settings.size)
+    fit, most = settings.refine, predicted
+    if settings.method == "tracks":
+        predicted = most = min(max(predicted, TRACKED[0]), TRACKED[1])
+    else:
+        if settings.budget != "ALL":
+            fit = fit or FIT_SECONDS * max(settings.size**2 / USUAL_PIXELS, 1)
+        if fit:
+            most = USUAL_GAUSSIANS * settings.size / USUAL_PIXELS**0.5
     kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
     count = min(kept, most, predicted)
     fits = 3 if settings.budget == "AUTO" else 1
@@ -50,6 +57,12 @@ def learn_speed(seconds: float, pixels: int, samples: int) -> None:
     _seconds_a_sample = max(seconds - START_SECONDS, 0.1) / max(pixels * samples, 1)
 
 
-def learn_number(method: str, gaussians: int, pixels: int) -> None:
-    """Remembers, for this session, how many Gaussians were predicted from so many pixels."""
-    _gaussians_a_pixel[method] = gaussians / max(pixels, 1)
+def learn_number(method: str, gaussians: int, pictures: int, size: int) -> None:
+    """Remembers, for this session, how many Gaussians a method made of so many pictures of this size."""
+    _gaussians_a_pixel[method] = gaussians / max(_pixels_that_count(method, pictures, size), 1)
+
+
+def _pixels_that_count(method: str, pictures: int, size: int) -> int:
+    """The pixels that the number of Gaussians goes by: those of all pictures, but of one for tracks, which are points
+    of the surface and lie as densely as its pixels."""
+    return size**2 * (1 if method == "tracks" else pictures)

@@ -14,6 +14,11 @@ RIG_COLLECTION = "Timesplat Cameras"  # the collection that `rigs` puts cameras 
 MOST_AUTOMATIC_FRAMES = 24  # frames that "every: automatic" comes near to
 CAPTURED_TYPES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD")
 METHODS = [
+    (
+        "tracks",
+        "Tracks",
+        "Surface points that Blender follows through the clip, with looks that all pictures share: sharpest",
+    ),
     ("guided", "Guided", "The network, led by depth and motion that Blender renders along"),
     ("lift", "Lift", "Depth and motion straight to Gaussians, without a network: fastest"),
     ("rgb", "Pictures Only", "The network from colour alone, as it would be for photographs"),
@@ -62,17 +67,17 @@ class Settings:
         description="Three suns and a grey world, which the network was trained with, in place of the scene's lights",
         default=True,
     )
-    method: EnumProperty(name="Method", items=METHODS, default="guided")
+    method: EnumProperty(name="Method", items=METHODS, default=METHODS[0][0])
     refine: FloatProperty(
         name="Refine",
-        description="Seconds for which the Gaussians are fitted to the pictures. 0: none where all are kept; for fewer "
-        "as long as it takes, 5 s for pictures of 128 pixels and more for larger ones",
-        default=0.0,
+        description="Seconds for which the Gaussians are fitted to the pictures, at most. 0: none for Tracks and where "
+        "all are kept; for fewer as long as it takes, 5 s for pictures of 128 pixels and more for larger ones",
+        default=10.0,
         min=0.0,
         max=3600.0,
         subtype="TIME_ABSOLUTE",
     )
-    budget: EnumProperty(name="Gaussians", items=BUDGETS, default="SHARE")
+    budget: EnumProperty(name="Gaussians", items=BUDGETS, default="ALL")
     share: FloatProperty(
         name="Share", description="Of the Gaussians predicted", default=10, min=0.1, max=100, subtype="PERCENTAGE"
     )

@@ -107,9 +107,9 @@ def _reconstruct(request: dict, progress) -> dict:
     from .io.ply import write_ply
 
     refine, budget, checkpoint = request.get("refine", 0.0), request.get("budget"), request.get("checkpoint")
-    if not (refine or budget):
+    if not (refine or budget) and request.get("method", "tracks") != "tracks":
         # A third of torch's start-up: what shapes its operations return, for compilers. What fits uses
-        # torch.optim, which loads them.
+        # torch.optim, which loads them; so do tracks' random numbers.
         sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
     from .clip import clip_of
     from .reconstruct import ReconstructOptions, default_method, reconstruct, untracked_note  # imports torch

@@ -8,13 +8,13 @@ from bpy.props import EnumProperty
 from .. import settings
 
 PRESETS = {  # what they differ in
-    "DRAFT": {"size": 64, "samples": 8, "method": "lift", "budget": "ALL", "refine": 0.0},
-    "BALANCED": {"size": 128, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 0.0},
-    "FINE": {"size": 256, "samples": 16, "method": "guided", "budget": "SHARE", "share": 10.0, "refine": 30.0},
+    "DRAFT": {"size": 128, "samples": 8, "method": "tracks", "budget": "ALL", "refine": 0.0},
+    "BALANCED": {"size": 256, "samples": 16, "method": "tracks", "budget": "ALL", "refine": 15.0},
+    "FINE": {"size": 512, "samples": 16, "method": "tracks", "budget": "ALL", "refine": 90.0},
 }
 PRESET_ITEMS = [
-    ("DRAFT", "Draft", "In a few seconds: small pictures, no network"),
-    ("BALANCED", "Balanced", "The best of a quarter of a minute"),
+    ("DRAFT", "Draft", "Small pictures, and their colours as they are: nothing is fitted"),
+    ("BALANCED", "Balanced", "Pictures of 256 pixels, a fit of a quarter of a minute"),
     ("FINE", "Fine", "Larger pictures, a longer fit"),
 ]
 

@@ -98,7 +98,7 @@ def start(chosen, context) -> jobs.Job:
         return child_process.start_worker(python, asked | places, folder)
 
     # The operator is gone by the time that a stage or the end comes: what they need is taken from it now.
-    look = chosen.look
+    look, size = chosen.look, chosen.size
     asked = {
         "task": "reconstruct",
         "method": chosen.method,
@@ -111,18 +111,20 @@ def start(chosen, context) -> jobs.Job:
 
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
-        if not (asked["budget"] or asked["refine"]):
-            estimates.learn_number(asked["method"], len(asset), pixels)
+        method = event.get("method", asked["method"])
+        if not asked["budget"] and (method == "tracks" or not asked["refine"]):  # a fit of tracks keeps nearly all
+            estimates.learn_number(method, len(asset), expected.pictures, size)
         ob = add_asset(asset, "Timesplat", look=look, context=bpy.context)
         originals.note_in(ob)
         ob["timesplat_lighting"] = shot["lighting"]
         said = f"{len(asset):,} Gaussians in {time.monotonic() - begun:.0f} s"
+        note = f" {event['note']}." if event.get("note") else ""
         if output:
             try:
                 write_ply(output, asset)
             except InputError as e:  # the result is there; only the file is not
-                return f"{said}, but {e}"
-        return said
+                return f"{said}, but {e}{note}"
+        return f"{said}.{note}" if note else said
 
     shares = [expected.rendering, expected.reconstructing]
     return jobs.start(

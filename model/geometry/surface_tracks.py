@@ -29,7 +29,8 @@ class TrackSettings:
 
     tolerance: float = 0.15  # of a path from its points, in pixels
     points_a_pixel: float = 1.0  # of surface, the size of a pixel at the object's middle
-    least: int = 4000  # points
+    least: int = 4000  # points …
+    densest: float = 4.0  # … but no more a pixel: so many share what is seen of a place that each is too faint to be kept
     most: int = 100_000
     footprint: float = 0.35  # σ along the surface, in distances between points
     thickness: float = 0.1  # σ across it, the same
@@ -52,8 +53,15 @@ def pixel_size(views: Views) -> float:
 
 def needed_points(surface: SurfaceTracks, views: Views, settings: TrackSettings = SETTINGS) -> int:
     """How many points the views' pixels need, of those that there are."""
-    wanted = settings.points_a_pixel * float(surface.area.sum()) / pixel_size(views) ** 2
-    return min(round(min(max(wanted, settings.least), settings.most)), len(surface))
+    pixels = _pixels(surface, views)
+    least = min(settings.least, settings.densest * pixels)
+    wanted = min(max(settings.points_a_pixel * pixels, least), settings.most)
+    return min(max(round(wanted), 1), len(surface))
+
+
+def _pixels(surface: SurfaceTracks, views: Views) -> float:
+    """How many pixels the surface would fill, laid out before the views."""
+    return float(surface.area.sum()) / pixel_size(views) ** 2
 
 
 def surface_tracks(
@@ -63,7 +71,8 @@ def surface_tracks(
     on a sheet that is seen from both sides. The views have depth. None where there are no points."""
     pixel = pixel_size(views)
     whole = float(surface.area.sum())
-    chosen = min(count or needed_points(surface, views, settings), len(surface))
+    most = max(round(settings.densest * _pixels(surface, views)), 1)
+    chosen = min(count or needed_points(surface, views, settings), most, len(surface))
     rows = ((np.arange(chosen) + 0.5) * len(surface) / chosen).astype(int) if chosen else np.zeros(0, int)
     place = torch.from_numpy(surface.position[rows])
     turn = F.normalize(torch.from_numpy(surface.rotation[rows].astype(np.float32)), dim=-1)

@@ -45,14 +45,22 @@ said.append(settings.cameras(bpy.context)[1])
 bpy.data.objects["Camera"].select_set(True)
 said.append(settings.cameras(bpy.context)[1])
 chosen.in_turn, chosen.every = True, 50
-counts = {}
+counts, chosen.method = {}, "guided"
 for budget, refine, size in (("ALL", 0, 128), ("SHARE", 0, 128), ("SHARE", 0, 32), ("NUMBER", 0, 128), ("ALL", 9, 256)):
     chosen.budget, chosen.refine, chosen.size, chosen.number = budget, refine, size, 100
     e = estimates.estimate(chosen, bpy.context)
     counts[f"{budget} {refine} {size}"] = [e.gaussians, e.reconstructing]
-estimates.learn_number("guided", 9000, 10_000)
+estimates.learn_number("guided", 9000, 1, 100)
 chosen.budget, chosen.refine, chosen.size = "ALL", 0, 128
 counts["learnt"] = estimates.estimate(chosen, bpy.context).gaussians
+chosen.method = "tracks"
+for budget, refine, size in (("ALL", 0, 128), ("ALL", 9, 256), ("SHARE", 0, 128), ("ALL", 0, 32), ("ALL", 0, 1024)):
+    chosen.budget, chosen.refine, chosen.size = budget, refine, size
+    e = estimates.estimate(chosen, bpy.context)
+    counts[f"tracks {budget} {refine} {size}"] = [e.gaussians, e.reconstructing]
+estimates.learn_number("tracks", 9000, 5, 128)
+chosen.size = 256
+counts["tracks learnt"] = estimates.estimate(chosen, bpy.context).gaussians
 tell(counts=counts, ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
      estimates=pictures)
 """
@@ -80,3 +88,14 @@ def test_what_the_settings_select(blender):
     assert counts["learnt"] == round(0.9 * 5 * 128**2)
     assert counts["ALL 9 256"][0] == 2 * FROM_DEPTH.max_gaussians
     assert counts["SHARE 0 128"][1] - counts["ALL 0 128"][1] == pytest.approx(5)
+
+    from timesplat.datagen import tracks  # the surface's pixels, however many pictures show them
+
+    assert [counts[f"tracks ALL 0 {n}"][0] for n in (32, 128, 1024)] == [
+        tracks.FEWEST,
+        round(0.63 * 128**2),
+        tracks.MOST,
+    ]
+    assert counts["tracks SHARE 0 128"][0] == round(0.063 * 128**2) and counts["tracks learnt"] == 4 * 9000
+    assert counts["tracks SHARE 0 128"][1] == counts["tracks ALL 0 128"][1]
+    assert counts["tracks ALL 9 256"] == [round(0.63 * 256**2), pytest.approx(3 + 9 + 5 * 256**2 * 1e-6)]

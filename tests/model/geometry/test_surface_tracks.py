@@ -75,6 +75,14 @@ def test_as_many_as_pixels_need_or_as_are_wanted():
     assert needed_points(many, big) == min(9000, round(whole / pixel_size(big) ** 2))
 
 
+def test_what_fills_few_pixels_is_kept():
+    """Points that lie more densely than pixels share what is seen of them, and what is faint is left out."""
+    seen, many = scenes.views(), scenes.surface(9000)
+    pixels = float(many.area.sum()) / pixel_size(seen) ** 2
+    tracks = surface_tracks(replace(many, area=many.area * np.float32(200 / pixels)), seen, 5000)
+    assert 500 < len(tracks) <= 800 and tracks.alive().all()
+
+
 def test_nothing_followed_makes_nothing():
     seen = scenes.views(2)
     none = replace(scenes.surface(1), **{k: v[:0] for k, v in vars(scenes.surface(1)).items()})
