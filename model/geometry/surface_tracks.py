@@ -30,7 +30,9 @@ class TrackSettings:
     tolerance: float = 0.15  # of a path from its points, in pixels
     points_a_pixel: float = 1.0  # of surface, the size of a pixel at the object's middle
     least: int = 4000  # points …
-    densest: float = 4.0  # … but no more a pixel: so many share what is seen of a place that each is too faint to be kept
+    densest: float = (
+        4.0  # … but no more a pixel: so many share what is seen of a place that each is too faint to be kept
+    )
     most: int = 100_000
     footprint: float = 0.35  # σ along the surface, in distances between points
     thickness: float = 0.1  # σ across it, the same
@@ -104,6 +106,8 @@ def surface_tracks(
     if len(seen) and len(unseen):
         parts.append(replace(points[unseen], rgb=tracks.rgb[_nearest(points, unseen, seen)]))
         tracks = _joined(parts)
+    if len(tracks) > settings.most:  # of sheets with two sides
+        tracks = tracks[torch.linspace(0, len(tracks) - 1, settings.most).round().long()]
     return tracks
 
 
