@@ -30,9 +30,7 @@ class TrackSettings:
     tolerance: float = 0.15  # of a path from its points, in pixels
     points_a_pixel: float = 1.0  # of surface, the size of a pixel at the object's middle
     least: int = 4000  # points …
-    densest: float = (
-        4.0  # … but no more a pixel: so many share what is seen of a place that each is too faint to be kept
-    )
+    densest: float = 4.0  # … but no more a pixel of surface, or each is so faint that it is left out
     most: int = 100_000
     footprint: float = 0.35  # σ along the surface, in distances between points
     thickness: float = 0.1  # σ across it, the same
