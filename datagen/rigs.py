@@ -131,6 +131,11 @@ def default_rig(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     return sorted(shots, key=lambda s: s.frame)  # stable: the cameras of a frame stay together
 
 
+def mixed(frames: Sequence[int], seed: int = 0) -> list[Shot]:
+    """As many views as the default rig has, from all around: the canonical cameras, and two random poses a frame."""
+    return sorted(canonical(frames) + random_poses(frames, seed, per_frame=2), key=lambda s: s.frame)
+
+
 def turntable(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     """For showing: one camera that goes once around the object over the clip, 20 degrees above it."""
     return [Shot(f, "turntable", "turntable", spherical(360 * i / len(frames), 20)) for i, f in enumerate(frames)]
@@ -206,6 +211,7 @@ RIGS: dict[str, Callable[[Sequence[int], int], list[Shot]]] = {
     "canonical": canonical,
     "elevated": elevated,
     "orbit": orbit,
+    "mixed": mixed,
     "turntable": turntable,
     "demo": demo_rig,
     "evaluation": evaluation,

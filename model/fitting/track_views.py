@@ -61,8 +61,8 @@ def reconstruct_tracks(
 
 
 def followed(views: Views) -> SurfaceTracks:
-    """The points that are followed through the clip: by the renderer, and by motion vectors where it followed nothing or
-    not all. Raises InputError where nothing can be followed."""
+    """The points that are followed through the clip: by the renderer, and by motion vectors where it followed nothing
+    or not all. Raises InputError where nothing can be followed."""
     known = views.surface if views.surface is not None and len(views.surface) else None
     if known is not None and not views.untracked:
         return known

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surface points followed through the whole clip from depth and motion vectors, where no mesh is known.
+"""Surface points followed through the clip from depth and motion vectors, where no mesh is known.
 
 What a pixel shows and no point explains becomes a new point. It goes along the scene flow from frame to frame, both
-ways, and is put right wherever a view sees it: its motion by the pixel's own motion vector, its depth by the depth map.
-It ends where a view sees through it.
+ways; each step is the least squares of the scene flow and of what the views of both frames show of the point, their
+motion vectors and their depth. Where a view sees through it, it ends. How far it may have strayed is kept account of:
+it is there while that is little, and beyond only where no other point is known (`track_windows`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import numpy as np
 from ...datagen.track_file import SurfaceTracks
 from ..parallel import chunks, parallel_for
 from ..views import Views
-from .rigid_relax import relax
 from .scene_flow import single
 
 # (numba's cache does not see another file change: where these are changed, this file must be touched.)
@@ -47,18 +47,20 @@ class MotionSettings(NamedTuple):
     deep: float = 2.0  # … and so near across it
     tolerance: float = 1.3  # across the surface, by which a point that is seen may be off, plus …
     drift: float = 0.3  # … this for each frame since it was last seen, …
-    most: float = 3.0  # … up to this
+    most: float = 3.0  # … up to this in all
     steepest: float = 0.2  # cosine: pixels that see the surface under less start no points
     doubt: float = 0.25  # share of a step that it may be wrong by, where no view sees the point, …
     doubt_seen: float = 0.06  # … and where one does; …
-    sure: float = 1.5  # … as long as the sum is below this it is sure where the point is …
-    gap: float = 1.2  # … and beyond where there is no other point so near
+    sure: float = 0.7  # … as long as the sum is below this it is sure where the point is …
+    lost: float = 6.0  # … up to where the sum is this, …
+    gap: float = 2.0  # … and beyond where there is no other point so near
     prior: float = 0.03  # weight of the scene flow against what motion vectors say of a point's own step
     depth: float = 4.0  # weight of the depth of what is seen, as a multiple of that of its motion
     turn: float = 0.3  # share by which a normal that is seen turns the point's
 
 
 MOTION = MotionSettings()
+COVERED = np.float32(1.4)  # area of surface to each of points that are 1 apart at least, sown at random
 
 
 class _Points(NamedTuple):
@@ -72,8 +74,8 @@ class _Points(NamedTuple):
 
 
 def motion_tracks(views: Views, known: SurfaceTracks | None = None, settings: MotionSettings = MOTION) -> SurfaceTracks:
-    """Points of what the views with depth and flow show, beside the `known` ones, which explain pixels but are not
-    returned. CPU tensors."""
+    """Points of what the views with depth and flow show, beside the `known` ones of the same clip, which explain pixels
+    but are not returned. CPU tensors."""
     frames = 1 if views.frame_step == 2 and not views.time.any() else round(2 / views.frame_step) + 1
     surface, field = surface_of(views)
     rules = single(settings)
@@ -82,14 +84,13 @@ def motion_tracks(views: Views, known: SurfaceTracks | None = None, settings: Mo
         window = np.stack([known.first, known.last], 1).astype(np.int64)
         there = [_Points(known.position, known.rotation, window, window, known.area)]
     found: list[_Points] = []
-    pixel = np.float32(np.median(surface.pixel))
+    pixel = np.float32(np.median(surface.pixel)) if len(surface.pixel) else np.float32(1)
     for f in _order(frames):
         new = _sown(surface, f, frames, [*there, *found], rules)
         jobs = chunks(len(new.area), 1024)
         parallel_for(jobs, lambda a, b, new=new, f=f: _follow(a, b, f, pixel, surface, field, rules, *new[:4]))
         found.append(new)
     points = _Points(*map(np.concatenate, zip(*found, strict=True)))
-    relax(points.position, points.rotation, points.most, pixel, surface, field)
     fill_gaps(points.position, points.sure, points.most, rules.gap * pixel)
     frame = np.arange(frames)[None].clip(points.sure[:, :1], points.sure[:, 1:])[..., None]
     return SurfaceTracks(
@@ -130,7 +131,7 @@ def _sown(surface: Surface, f: int, frames: int, points: list[_Points], rules: M
     position, rotation = np.zeros((n, frames, 3), np.float32), np.zeros((n, frames, 4), np.float32)
     position[:], rotation[:] = surface.place[rows, None], surface.turn[rows, None]
     when = np.full((n, 2), f)
-    return _Points(position, rotation, when, when.copy(), (rules.apart * surface.pixel[rows]) ** 2 * np.float32(1.4))
+    return _Points(position, rotation, when, when.copy(), COVERED * (rules.apart * surface.pixel[rows]) ** 2)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -208,7 +209,7 @@ def _follow_one(here, side, size, surface, field, rules, position, rotation):
                 r = seen_at(p, normal, j, tolerance, surface)
                 if r >= 0:
                     w = weight_of(p, normal, r, surface)
-                    gather(p, r, w, side, direction, interval, surface, field, m, other, rows)
+                    gather(r, w, side, direction, interval, surface, field, m, other, rows)
         solve(rows, rules.prior, more)
         turn(q, spin)
         third_axis(q, normal)
@@ -220,7 +221,7 @@ def _follow_one(here, side, size, surface, field, rules, position, rotation):
                 r = seen_at(p, normal, j, tolerance, surface)
                 if r >= 0:
                     w = weight_of(p, normal, r, surface)
-                    gather(p, r, w, 1 - side, direction, interval, surface, field, m, other, rows)
+                    gather(r, w, 1 - side, direction, interval, surface, field, m, other, rows)
         other[:] = p
         seen = gone = False
         for j in range(len(surface.frame)):
@@ -236,7 +237,7 @@ def _follow_one(here, side, size, surface, field, rules, position, rotation):
         solve(rows, rules.prior, more)
         for k in range(3):
             p[k] = start[k] + flow[k] + more[k]
-        if gone:
+        if gone or doubt > rules.lost:
             break
         square = np.float32(0)
         for k in range(3):

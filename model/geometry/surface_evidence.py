@@ -96,10 +96,7 @@ def seen_at(p, normal, j, tolerance, surface):
                 continue
             size = surface.pixel[r]
             across, along = off(p, r, surface)
-            cosine = np.float32(0)
-            for k in range(3):
-                cosine += normal[k] * surface.normal[r, k]
-            most = tolerance if cosine > 0 else SHEET
+            most = tolerance if _cosine(normal, r, surface) > 0 else SHEET
             if across < most * size:
                 behind = False
             here = x == u and y == v
@@ -111,10 +108,10 @@ def seen_at(p, normal, j, tolerance, surface):
 
 
 @numba.njit(cache=True, fastmath=True)
-def gather(p, r, weight, side, sign, interval, surface, field, m, flow, rows):
-    """Adds to rows (9), the lower triangle of the normal equations of what the scene flow lacks at p (3) and their right
-    side, what the motion vector of row r says, to the next frame (side 1) or the previous one (0); sign: 1 if they are
-    of a motion to the next frame, -1 to the previous. m (6) and flow (3) are written over."""
+def gather(r, weight, side, sign, interval, surface, field, m, flow, rows):
+    """Adds to rows (9), the lower triangle of the normal equations of what the scene flow lacks and their right side,
+    what the motion vector of row r says, to the next frame (side 1) or the previous one (0); sign: 1 if they are of a
+    motion to the next frame, -1 to the previous. m (6) and flow (3) are written over."""
     turned = np.float32(2 * side - 1)  # the way of the motion vector
     flow_at(field, interval, surface.place[r], m, flow)
     A = surface.constraint[r, side]
@@ -144,13 +141,16 @@ def solve(rows, prior, out):
 
 
 @numba.njit(cache=True, fastmath=True)
+def _cosine(normal, r, surface):
+    n = surface.normal[r]
+    return normal[0] * n[0] + normal[1] * n[1] + normal[2] * n[2]
+
+
+@numba.njit(cache=True, fastmath=True)
 def weight_of(p, normal, r, surface):
     """How much a point p (3) with its normal (3) is to be taken for what row r shows, 0..1."""
     across, along = off(p, r, surface)
-    cosine = np.float32(0)
-    for k in range(3):
-        cosine += normal[k] * surface.normal[r, k]
-    size = surface.pixel[r]
+    cosine, size = _cosine(normal, r, surface), surface.pixel[r]
     return np.exp(-((2 * across / size) ** 2) - (along / size) ** 2) * max(abs(cosine), np.float32(0.1)) ** 2
 
 
@@ -195,10 +195,10 @@ def gather_depth(p, r, weight, more, surface, rows):
 @numba.njit(cache=True, fastmath=True)
 def lean(q, normal, r, part, surface):
     """Turns q (4), whose third axis is normal (3), by a part of the way to the normal of row r, or to its opposite."""
-    n, w, cosine = surface.normal[r], np.empty(3, np.float32), np.float32(0)
-    for k in range(3):
-        cosine += normal[k] * n[k]
+    n, w = surface.normal[r], np.empty(3, np.float32)
+    if _cosine(normal, r, surface) < 0:
+        part = -part
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
-        w[k] = (part if cosine > 0 else -part) * (normal[a] * n[b] - normal[b] * n[a])
+        w[k] = part * (normal[a] * n[b] - normal[b] * n[a])
     turn(q, w)

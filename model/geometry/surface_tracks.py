@@ -104,6 +104,8 @@ def surface_tracks(
     if len(seen) and len(unseen):
         parts.append(replace(points[unseen], rgb=tracks.rgb[_nearest(points, unseen, seen)]))
         tracks = _joined(parts)
+    if len(tracks) > settings.most:  # of sheets with two sides
+        tracks = tracks[torch.linspace(0, len(tracks) - 1, settings.most).round().long()]
     return tracks
 
 
