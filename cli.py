@@ -126,7 +126,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     from .model.geometry.coverage import coverage
     from .model.io.ply import write_ply
     from .model.methods import ReconstructOptions, method_named
-    from .model.reconstruct import default_method, untracked_note
+    from .model.reconstruct import chosen_method, untracked_note
     from .model.reconstruct import reconstruct as run
     from .model.views import load_views
 
@@ -144,12 +144,12 @@ def reconstruct(args: argparse.Namespace) -> int:
     if args.rig and args.rig not in rigs:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else [i for i, v in enumerate(seq.views) if v.rig != "target"]
-    method = method_named(args.method or default_method(seq, indices))
+    method = method_named(chosen_method(seq, args.method, indices))
     g = run(seq, method.name, indices, options)
     write_ply(args.out, g.to_asset(clip_of(seq)))
     taken = time.perf_counter() - start
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")
-    if method.name == "tracks" and (note := untracked_note(seq)):
+    if method.has_depth and (note := untracked_note(seq)):
         print(note)
     if method.knows_surface and not (args.refine or args.budget):
         share, _ = coverage(g, load_views(seq, indices, method.has_depth))

@@ -25,6 +25,13 @@ def default_method(sequence: Sequence, indices=None) -> str:
     return "tracks" if sequence.tracks and len(sequence.load_tracks()) else "guided"
 
 
+def chosen_method(sequence: Sequence, asked: str | None, indices=None) -> str:
+    """What was asked for, or `default_method`; this too in place of tracks where the renderer found nothing that it
+    could follow: of a metaball, whose surface comes and goes, motion vectors make worse tracks than the network."""
+    nothing = asked == "tracks" and bool(sequence.tracks) and not len(sequence.load_tracks())
+    return default_method(sequence, indices) if nothing or not asked else asked
+
+
 def untracked_note(sequence: Sequence) -> str:
     """What is to be said of objects whose surfaces could not be followed; nothing where there are none."""
     names = ", ".join(sequence.untracked[:4]) + (" and others" if len(sequence.untracked) > 4 else "")
@@ -45,7 +52,7 @@ def reconstruct(
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint, and a device that cannot
     be used."""
     report = progress or (lambda fraction, text: None)
-    method = method or default_method(sequence, indices)
+    method = chosen_method(sequence, method, indices)
     has_depth = method_named(method).has_depth
     report(0.0, "reading views")
     indices = range(len(sequence.views)) if indices is None else indices

@@ -112,9 +112,10 @@ def _reconstruct(request: dict, progress) -> dict:
         # torch.optim, which loads them; so do tracks' random numbers.
         sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
     from .clip import clip_of
-    from .reconstruct import ReconstructOptions, default_method, reconstruct, untracked_note  # imports torch
+    from .methods import method_named
+    from .reconstruct import ReconstructOptions, chosen_method, reconstruct, untracked_note  # imports torch
 
-    method = request.get("method") or default_method(sequence, indices)
+    method = chosen_method(sequence, request.get("method"), indices)
     options = ReconstructOptions(
         device=request.get("device", "cpu"),
         checkpoint=Path(checkpoint) if checkpoint else None,
@@ -136,7 +137,7 @@ def _reconstruct(request: dict, progress) -> dict:
         raise InputError(f"{sequence.root}: nothing was found to reconstruct; check that views show the object.")
     progress(0.95, "writing the asset")
     write_ply(request["asset"], gaussians.to_asset(clip_of(sequence)))
-    note = untracked_note(sequence) if method == "tracks" else ""
+    note = untracked_note(sequence) if method_named(method).has_depth else ""
     return {"asset": request["asset"], "gaussians": len(gaussians), "method": method, "note": note}
 
 

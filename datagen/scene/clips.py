@@ -53,7 +53,7 @@ def find_clips(imported: bool) -> list[Clip]:
 def _animated_ids() -> list:
     """Every data-block of the file that carries animation data (objects, shape keys, materials, …)."""
     found = []
-    for name in ("objects", "shape_keys", "meshes", "armatures", "materials", "curves", "lattices"):
+    for name in ("objects", "shape_keys", "meshes", "armatures", "materials", "curves", "lattices", "metaballs"):
         found += [x for x in getattr(bpy.data, name, ()) if x.animation_data]
     trees = [x.node_tree for x in bpy.data.materials if x.node_tree]
     return found + [x for x in (*trees, *bpy.data.node_groups) if x.animation_data]
