@@ -80,7 +80,7 @@ def surface_tracks(
     path, offset, rotation, paths = ride(place, turn, window, settings.tolerance * pixel)
     spacing = (whole / chosen) ** 0.5 if chosen else pixel
     # Seen squarely, by how many each place is covered, as wide as the rasteriser draws them. More opacity than this
-    # makes silhouettes, where one looks along the surface, too wide: that cost 5 dB.
+    # makes silhouettes, where one looks along the surface, too wide: three times as much cost 3 dB.
     layers = 2 * math.pi * (settings.footprint**2 + BLUR * (pixel / spacing) ** 2)
     opacity = min(settings.opacity, settings.cover / layers)
     scale = spacing * torch.tensor([settings.footprint, settings.footprint, settings.thickness])
