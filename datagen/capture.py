@@ -179,18 +179,18 @@ def _write_view(
 
 def _write_tracks(seq: Sequence, folder: Path, subject: Subject, settings: CaptureSettings) -> None:
     """Writes the surface tracks below `folder`, and sets the Sequence's path and the names of what has none."""
-    pixel = float(np.median([np.linalg.norm(v.c2w[:3, 3]) / v.fx for v in seq.views]))
     tracks, seq.untracked = track_surfaces(
         subject.frames,
         subject.normalisation,
-        pixel,
+        seq.pixel_size,
         settings.tracks or 0,
         objects=subject.objects,
         shift=subject.shift,
         seed=settings.seed,
     )
-    seq.tracks = "tracks.npz"
-    write_tracks(folder / seq.tracks, tracks)
+    if len(tracks):
+        seq.tracks = "tracks.npz"
+        write_tracks(folder / seq.tracks, tracks)
 
 
 def _scene_frames_per_frame(frames: list[int]) -> int:

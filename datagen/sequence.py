@@ -99,6 +99,11 @@ class Sequence:
         """-1..1 over the clip; 0 where the clip is one frame."""
         return 2 * self.unit_time(frame) - 1 if self.frame_end > self.frame_start else 0.0
 
+    @property
+    def pixel_size(self) -> float:
+        """The median over the views of a pixel's size at the origin, in normalised units."""
+        return float(np.median([np.linalg.norm(v.c2w[:3, 3]) / v.fx for v in self.views]))
+
     def times(self, indices=None) -> np.ndarray:
         """(V,) float32 model times of the views (or of those at `indices`)."""
         views = self.views if indices is None else [self.views[i] for i in indices]

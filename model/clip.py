@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from ..datagen.sequence import Sequence
-from .io.asset import Clip, pixel_size
+from .io.asset import Clip
 
 
 def clip_of(seq: Sequence) -> Clip:
@@ -17,4 +17,4 @@ def clip_of(seq: Sequence) -> Clip:
         if apart > 0 and frames == [min(frames[0] + i * apart, frames[-1]) for i in range(count)]:
             first, step = frames[0], apart
     n = seq.normalisation
-    return Clip(seq.fps * step, first, first + step * (count - 1), n.scale, tuple(n.translation), pixel_size(seq))
+    return Clip(seq.fps * step, first, first + step * (count - 1), n.scale, tuple(n.translation), seq.pixel_size)

@@ -22,13 +22,13 @@ def default_method(sequence: Sequence, indices=None) -> str:
     views = sequence.views if indices is None else [sequence.views[i] for i in indices]
     if not all(v.passes for v in views):
         return "rgb"
-    return "tracks" if sequence.tracks and len(sequence.load_tracks()) else "guided"
+    return "tracks" if sequence.tracks else "guided"
 
 
 def chosen_method(sequence: Sequence, asked: str | None, indices=None) -> str:
     """What was asked for, or `default_method`; this too in place of tracks where the renderer found nothing that it
     could follow: of a metaball, whose surface comes and goes, motion vectors make worse tracks than the network."""
-    nothing = asked == "tracks" and bool(sequence.tracks) and not len(sequence.load_tracks())
+    nothing = asked == "tracks" and not sequence.tracks and bool(sequence.untracked)
     return default_method(sequence, indices) if nothing or not asked else asked
 
 

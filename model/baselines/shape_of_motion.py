@@ -27,7 +27,7 @@ from ..gaussians import Gaussians4D
 from ..geometry.plane_sweep import sweep_geometry
 from ..io.asset import Clip
 from ..parallel import work_clock
-from ..rotations import quaternion_multiply
+from ..rotations import quaternion_multiply, rotate
 from ..views import Views
 from .visual_hull import white
 
@@ -95,9 +95,7 @@ class Motion:
 def moved(xyz: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     """Points (…,3) and the blended bases (…,7) of each -> the points moved, and the unit quaternions (…,4)."""
     turn = F.normalize(pose[..., :4], dim=-1)
-    w, axis = turn[..., :1], turn[..., 1:]
-    cross = torch.linalg.cross(axis, xyz)
-    return xyz + 2 * (w * cross + torch.linalg.cross(axis, cross)) + pose[..., 4:], turn
+    return rotate(turn, xyz) + pose[..., 4:], turn
 
 
 def clusters(points: Tensor, count: int, generator) -> Tensor:

@@ -34,7 +34,6 @@ def reconstruct_tracks(
     budget: str | None = None,
     max_loss: float = 0.1,
     steps: int | None = None,
-    seed: int = 0,
     progress=None,
 ) -> Tracks4D:
     """Views with depth, motion vectors and, where the renderer wrote them, tracks of the surface -> tracks, after at
@@ -53,7 +52,7 @@ def reconstruct_tracks(
     if not (seconds or steps) or not len(start):
         return start
     most = max(FIT.least_steps, FIT.steps_a_view * len(views))
-    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None, seed=seed)
+    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None)
     told = part(progress, search, 1)
     warm_up("cpu")
     fitted = fit_tracks(start, views, schedule, pixel=pixel_size(views), progress=told)

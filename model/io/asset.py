@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...datagen.sequence import InputError, Sequence
+from ...datagen.sequence import InputError
 from .paths import Paths, inverse, multiply, rotate
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C0 * f_dc
@@ -217,11 +217,6 @@ def _check_paths(p: Paths, path: np.ndarray | None, n: int, bad: Callable[[str],
         raise bad("its paths hold quaternions that are not of unit length")
     if path is None or path.shape != (n,) or path.min() < 0 or path.max() >= len(p):
         raise bad("it has Gaussians on paths that are not there")
-
-
-def pixel_size(sequence: Sequence) -> float:
-    """Clip.pixel: the median over the views of a pixel's size at the origin, in normalised units."""
-    return float(np.median([np.linalg.norm(v.c2w[:3, 3]) / v.fx for v in sequence.views]))
 
 
 def rotation_matrices(q: np.ndarray) -> np.ndarray:

@@ -4,12 +4,10 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError, read_sequence
-from timesplat.datagen.track_file import SurfaceTracks, write_tracks
 from timesplat.model import baselines  # noqa: F401, adds its methods
 from timesplat.model.methods import ReconstructOptions
 from timesplat.model.network import Config
@@ -37,15 +35,10 @@ def test_untrained_guided_network_is_the_lift(sphere_folder, checkpoint):
 def test_the_method_that_suits_what_was_rendered(sphere_folder, tmp_path):
     seq = read_sequence(sphere_folder)
     assert chosen_method(seq, None) == "guided" and chosen_method(seq, "tracks") == "tracks"
-    frames = seq.frame_end - seq.frame_start + 1
-    for points, suits in ((3, "tracks"), (0, "guided")):
-        turn = np.tile(np.array([1, 0, 0, 0], np.float16), (points, frames, 1))
-        place, one = np.zeros((points, frames, 3), np.float32), np.ones(points, np.float32)
-        first, last = np.zeros(points, np.int32), np.full(points, frames - 1, np.int32)
-        write_tracks(tmp_path / "tracks.npz", SurfaceTracks(place, turn, first, last, one))
-        followed = replace(seq, root=tmp_path, tracks="tracks.npz")
-        assert chosen_method(followed, None) == chosen_method(followed, "tracks") == suits
-        assert chosen_method(followed, "lift") == "lift"
+    followed, nothing = replace(seq, tracks="tracks.npz"), replace(seq, untracked=["Smoke"])
+    assert chosen_method(followed, None) == chosen_method(followed, "tracks") == "tracks"
+    assert chosen_method(nothing, None) == chosen_method(nothing, "tracks") == "guided"
+    assert chosen_method(followed, "lift") == chosen_method(nothing, "lift") == "lift"
     bare = replace(seq, views=[replace(v, passes=None) for v in seq.views])
     assert chosen_method(bare, None) == "rgb"
     assert untracked_note(seq) == "" and "Smoke, Fire: " in untracked_note(replace(seq, untracked=["Smoke", "Fire"]))
