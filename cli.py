@@ -100,7 +100,8 @@ def train(args: argparse.Namespace) -> int:
 
 
 def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote (or another in its format)")
+    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote, or one in the format "
+                   "of D-NeRF")  # fmt: skip
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
     p.add_argument("--method", help="tracks, lift, guided, rgb, sweep, predicted, 4dgs (default: tracks "
                    "where the renderer wrote surface tracks, else guided where it wrote depth, else rgb)")  # fmt: skip
@@ -111,6 +112,8 @@ def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--budget", help="most Gaussians: a number, a share of those predicted such as 10%%, or auto: as "
                    "many as the scene needs; fits them for --refine seconds, or 5")  # fmt: skip
     p.add_argument("--max-loss", type=float, default=0.1, help="dB that --budget auto may lose (default: 0.1)")
+    p.add_argument("--size", type=int, metavar="PIXELS", help="read the pictures at this size of their longer side, a "
+                   "whole fraction of theirs (default: theirs)")  # fmt: skip
     p.add_argument("--rig", help="use only the views of this rig")
     p.add_argument("--checkpoint", type=Path, help="weights in place of the shipped ones")
     p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
@@ -120,7 +123,8 @@ def reconstruct(args: argparse.Namespace) -> int:
     """Reconstruct a Sequence as one 4D Gaussian asset (.ply)."""
     import time
 
-    from .datagen.sequence import read_sequence
+    from .datagen.readers import open_sequence
+    from .evaluation.protocol import all_inputs
     from .model import baselines  # noqa: F401, adds its methods
     from .model.clip import clip_of
     from .model.geometry.coverage import coverage
@@ -139,20 +143,20 @@ def reconstruct(args: argparse.Namespace) -> int:
         budget=args.budget,
         max_loss=args.max_loss,
     )
-    seq = read_sequence(args.sequence)
+    seq = open_sequence(args.sequence)
     rigs = sorted({v.rig for v in seq.views})
     if args.rig and args.rig not in rigs:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
-    indices = seq.select(rig=args.rig) if args.rig else [i for i, v in enumerate(seq.views) if v.rig != "target"]
+    indices = seq.select(rig=args.rig) if args.rig else all_inputs(seq)
     method = method_named(chosen_method(seq, args.method, indices))
-    g = run(seq, method.name, indices, options)
+    g = run(seq, method.name, indices, options, size=args.size)
     write_ply(args.out, g.to_asset(clip_of(seq)))
     taken = time.perf_counter() - start
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")
     if method.has_depth and (note := untracked_note(seq)):
         print(note)
     if method.knows_surface and not (args.refine or args.budget):
-        share, _ = coverage(g, load_views(seq, indices, method.has_depth))
+        share, _ = coverage(g, load_views(seq, indices, method.has_depth, args.size))
         print(f"coverage {share:.0%}" + ("" if share > 0.99 else ": what no camera saw is left open"))
     return 0
 

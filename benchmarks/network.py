@@ -29,7 +29,7 @@ from torch import nn
 
 from timesplat.benchmarks.cameras import ring
 from timesplat.benchmarks.timing import least
-from timesplat.datagen.sequence import read_sequence, sequences_in
+from timesplat.datagen.readers import open_sequence, sequences_in
 from timesplat.evaluation.image_quality import psnr
 from timesplat.evaluation.scoring import draw
 from timesplat.model.checkpoints_io import CHECKPOINTS, load_network
@@ -118,7 +118,7 @@ def row(name: str, views: Views, drop: bool, device: str, roof: float, seconds: 
 def objects(folders: list[Path]):
     """Name, input Views and held-out Views of every Sequence below the folders."""
     for found in [f for folder in folders for f in sequences_in(folder)]:
-        seq = read_sequence(found)
+        seq = open_sequence(found)
         inputs = load_views(seq, seq.select(rig="alternating"), has_depth=True)
         yield found.parent.name, inputs, load_views(seq, seq.select(rig="target"))
 

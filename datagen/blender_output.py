@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .image_files import read_exr
-from .sequence import Passes
+from .passes import Passes
 
 BACKGROUND_DEPTH = 1e9  # Blender writes 1e10 where a pixel's depth sample met nothing
 

@@ -23,18 +23,17 @@ import numpy as np
 from . import displace
 from .blender_output import read_multilayer, to_passes, to_straight_srgb
 from .image_files import write_png
+from .passes import Passes, write_passes
 from .render_setup import CaptureSettings, MultiViewCameras, add_even_light, apply_settings, temporary_data
 from .rigs import Shot
 from .scene.borrow import borrowed
 from .sequence import (
     InputError,
     Normalisation,
-    Passes,
     Sequence,
     View,
     distinct,
     focal_from_fov,
-    write_passes,
     write_sequence,
 )
 from .track_file import write_tracks
@@ -107,7 +106,7 @@ def capture(
                 for file in files:
                     view = seq.views[done]
                     _write_view(
-                        view, f"{names[view.rig, view.camera]}_{view.frame:04d}", file, folder, subject, settings
+                        view, f"{names[view.rig, view.camera]}_{int(view.frame):04d}", file, folder, subject, settings
                     )
                     done += 1
                 progress(done, len(shots))
@@ -171,7 +170,7 @@ def _write_view(
     if settings.passes:
         view.passes = f"passes/{name}.exr"
         passes = to_passes(channels, subject.normalisation.scale)
-        _scale_flow_to_steps(passes, subject.frames, view.frame)
+        _scale_flow_to_steps(passes, subject.frames, int(view.frame))
         if subject.shift is not None:
             displace.add_flow(passes, view, subject.shift)
         write_passes(folder / view.passes, passes, channels["combined"] if settings.linear else None)

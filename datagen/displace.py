@@ -13,8 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from .passes import Passes
 from .rigs import Shot
-from .sequence import Normalisation, Passes, View, opengl_to_opencv
+from .sequence import Normalisation, View, opengl_to_opencv
 
 
 def displacements(
@@ -61,8 +62,9 @@ def add_flow(passes: Passes, view: View, shift: np.ndarray) -> None:
     ray = np.stack([(x + 0.5 - view.cx) / view.fx, (y + 0.5 - view.cy) / view.fy, np.ones(len(x))], 1)
     points = ray * z[:, None]
     turn = opengl_to_opencv(view.c2w)[:3, :3]
-    for flow, other in ((passes.flow_next, view.frame + 1), (passes.flow_prev, view.frame - 1)):
+    now = int(view.frame)
+    for flow, other in ((passes.flow_next, now + 1), (passes.flow_prev, now - 1)):
         there = min(max(other, 0), len(shift) - 1)
-        p = points + (shift[there] - shift[view.frame]) @ turn
+        p = points + (shift[there] - shift[now]) @ turn
         for axis, (focal, start) in enumerate(((view.fx, ray[:, 0]), (view.fy, ray[:, 1]))):
             flow[y, x, axis] += (focal * (p[:, axis] / p[:, 2] - start)).astype(np.float32)

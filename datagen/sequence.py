@@ -2,7 +2,7 @@
 """A Sequence: images of an object with the camera and the moment of each, as a folder anyone can read.
 
 The layout is the one of NeRF and D-NeRF datasets (`transforms.json`, `images/`, `passes/`), so that
-other programs read it as it is. numpy only: neither bpy nor torch is needed here.
+other programs read it as it is. What others wrote comes by `readers`. numpy only: neither bpy nor torch is needed here.
 
 Conventions
     world       right-handed, Z up; positions are normalised: the object's bounds over the whole clip are
@@ -21,21 +21,17 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from .image_files import write_exr
+from .errors import InputError
+from .passes import Passes, read_passes
 from .track_file import SurfaceTracks, read_tracks
 
 FORMAT = "timesplat-sequence-1"
-
-
-class InputError(ValueError):
-    """Something the user gave cannot be used. The message is one sentence that names the file, says what
-    is wrong and what to do; the command line prints it and exits with code 2."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class Normalisation:
 class View:
     """One image: a camera at a moment."""
 
-    frame: int  # frame number in the scene
+    frame: float  # frame number in the scene; whole ones are int, as in all that we render
     camera: str  # camera id: views that share it were taken by one (possibly moving) camera
     rig: str  # name of the rig it belongs to
     c2w: np.ndarray  # (4,4) float64, OpenGL axes, normalised space, orthonormal rotation
@@ -90,6 +86,7 @@ class Sequence:
     tracks: str | None = None  # path below the folder: surface points followed through the clip, see `track_file`
     untracked: list[str] = field(default_factory=list)  # what is seen and has none, by the objects' names
     root: Path | None = None  # the folder it was read from
+    remedy: str = "render the Sequence again"  # what to do where a file of it is missing or damaged
 
     def unit_time(self, frame: float) -> float:
         """0..1 over the clip; 0 where the clip is one frame."""
@@ -122,7 +119,7 @@ class Sequence:
             raise ValueError("this Sequence is not on disk yet")
         return self.root
 
-    def select(self, *, camera: str | None = None, rig: str | None = None, frame: int | None = None) -> list[int]:
+    def select(self, *, camera: str | None = None, rig: str | None = None, frame: float | None = None) -> list[int]:
         """Indices of the views that match every argument given."""
         return [
             i
@@ -141,13 +138,13 @@ class Sequence:
             with Image.open(path) as im:
                 rgba = np.asarray(im.convert("RGBA"))
         except FileNotFoundError:
-            raise InputError(f"{path}: the image is missing; render the Sequence again.") from None
+            raise InputError(f"{path}: the image is missing; {self.remedy}.") from None
         except Exception as e:
-            raise InputError(f"{path}: the image cannot be read ({e}); render the Sequence again.") from None
+            raise InputError(f"{path}: the image cannot be read ({e}); {self.remedy}.") from None
         if rgba.shape != (self.height, self.width, 4):
             raise InputError(
-                f"{path}: the image is {rgba.shape[1]}x{rgba.shape[0]} but transforms.json says "
-                f"{self.width}x{self.height}; render the Sequence again."
+                f"{path}: the image is {rgba.shape[1]}x{rgba.shape[0]} but those of the Sequence are "
+                f"{self.width}x{self.height}; {self.remedy}."
             )
         return rgba
 
@@ -173,21 +170,6 @@ class Sequence:
             raise InputError(f"{path}: the tracks cannot be read ({e}); render the Sequence again.") from None
 
 
-@dataclass
-class Passes:
-    """What Blender knows of a view beyond its picture, in pixel rows from the top.
-
-    depth (H,W) float32: planar z of the first surface in normalised units, inf where there is none
-    (pixels whose depth is mixed with the background's are set to inf as well);
-    flow_next, flow_prev (H,W,2) float32: where the surface point seen at the pixel is one frame later /
-    earlier, minus where it is now, in pixels, x right, y DOWN, for a camera that stands still.
-    """
-
-    depth: np.ndarray
-    flow_next: np.ndarray
-    flow_prev: np.ndarray
-
-
 def opengl_to_opencv(c2w: np.ndarray) -> np.ndarray:
     """c2w (…,4,4): OpenGL camera axes (y up, looks along -z) -> OpenCV (y down, looks along +z), or back."""
     return c2w * np.array([1.0, -1.0, -1.0, 1.0])
@@ -196,48 +178,6 @@ def opengl_to_opencv(c2w: np.ndarray) -> np.ndarray:
 def focal_from_fov(fov_degrees: float, size: int) -> float:
     """Focal length in pixels of a square image of `size` pixels with the given full field of view."""
     return 0.5 * size / math.tan(math.radians(fov_degrees) / 2)
-
-
-# ---------------------------------------------------------------- depth and motion vectors
-
-
-def read_passes(path: Path, shape: tuple[int, int]) -> Passes:
-    """Reads channels Z, flow_next.x/.y, flow_prev.x/.y of a single-part EXR written by `write_passes`."""
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as f:
-            channel = {k: np.asarray(c.pixels, np.float32) for k, c in f.channels().items()}
-        depth = channel["Z"]
-        flow = [np.stack([channel[f"{n}.x"], channel[f"{n}.y"]], -1) for n in ("flow_next", "flow_prev")]
-    except KeyError as e:
-        raise InputError(f"{path}: the channel {e} is missing; render the Sequence again.") from None
-    except Exception as e:
-        hint = "is missing" if not Path(path).exists() else f"cannot be read ({e})"
-        raise InputError(f"{path}: the depth pass {hint}; render the Sequence again.") from None
-    if depth.shape != shape:
-        raise InputError(
-            f"{path}: the depth pass is {depth.shape[1]}x{depth.shape[0]} but transforms.json says "
-            f"{shape[1]}x{shape[0]}; render the Sequence again."
-        )
-    if np.isnan(depth).any() or not all(np.isfinite(x).all() for x in flow):
-        raise InputError(f"{path}: the depth pass holds NaN or infinite motion; render the Sequence again.")
-    depth[(depth <= 0) | (depth >= 1e9)] = np.inf
-    return Passes(depth, *flow)
-
-
-def write_passes(path: Path, passes: Passes, combined: np.ndarray | None = None) -> None:
-    """Single-part ZIP EXR: Z (float), flow_next/flow_prev (half), and R G B A (half, scene-linear
-    premultiplied) where `combined` (H,W,4) is given. Infinite depth is written as 1e10, as Blender does."""
-    half = np.float16
-    channels = {"Z": np.where(np.isinf(passes.depth), 1e10, passes.depth).astype(np.float32)}
-    for name, flow in (("flow_next", passes.flow_next), ("flow_prev", passes.flow_prev)):
-        for i, axis in enumerate("xy"):
-            channels[f"{name}.{axis}"] = np.ascontiguousarray(flow[..., i], half)
-    if combined is not None:
-        for i, c in enumerate("RGBA"):
-            channels[c] = np.ascontiguousarray(combined[..., i], half)
-    write_exr(path, channels)
 
 
 # ---------------------------------------------------------------- the folder
@@ -343,17 +283,6 @@ def distinct(names: list[str]) -> list[str]:
     return found
 
 
-def sequences_in(root: Path) -> list[Path]:
-    """The folders of finished Sequences at any depth of `root`, itself included, sorted. Hidden folders are left out:
-    a Sequence is rendered in one and renamed when it is whole, perhaps at this moment."""
-    found = []
-    for folder, below, files in os.walk(root):
-        below[:] = [name for name in below if not name.startswith(".")]
-        if "transforms.json" in files:
-            found.append(Path(folder))
-    return sorted(found)
-
-
 def read_sequence(folder: Path) -> Sequence:
     """Reads and checks `folder/transforms.json`; images are read later, but that they exist is checked now.
 
@@ -364,16 +293,17 @@ def read_sequence(folder: Path) -> Sequence:
     path = folder / "transforms.json"
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a folder that `timesplat render` wrote.")
-    try:
+    with read_from(path):
         d = json.loads(path.read_text(encoding="utf-8"))
         norm = d.get("normalisation", {})
         x, y, z = norm.get("translation", (0, 0, 0))
+        frames = [frame_number(f["frame"]) for f in d["frames"]]
         seq = Sequence(
             width=int(d["w"]),
             height=int(d["h"]),
             fps=float(d.get("fps", 24.0)),
-            frame_start=int(d.get("frame_start", 0)),
-            frame_end=int(d.get("frame_end", 0)),
+            frame_start=int(d.get("frame_start", min(frames, default=0) // 1)),
+            frame_end=int(d.get("frame_end", -(max(frames, default=0) // -1))),
             normalisation=Normalisation(float(norm.get("scale", 1.0)), (float(x), float(y), float(z))),
             aabb=d.get("aabb", [[-1, -1, -1], [1, 1, 1]]),
             provenance=d.get("provenance", {}),
@@ -381,37 +311,68 @@ def read_sequence(folder: Path) -> Sequence:
             untracked=[str(name) for name in d.get("untracked", [])],
             root=folder,
         )
-        for f in d["frames"]:
+        for frame, f in zip(frames, d["frames"], strict=True):
+            fx, fy = focal_lengths(d | f, seq.width)
             seq.views.append(
                 View(
-                    frame=int(f["frame"]),
+                    frame=frame,
                     camera=str(f.get("camera", "0")),
                     rig=str(f.get("rig", "")),
                     c2w=np.array(f["transform_matrix"], dtype=np.float64),
-                    fx=float(f.get("fl_x", d.get("fl_x"))),
-                    fy=float(f.get("fl_y", d.get("fl_y"))),
+                    fx=fx,
+                    fy=fy,
                     cx=float(f.get("cx", d.get("cx", seq.width / 2))),
                     cy=float(f.get("cy", d.get("cy", seq.height / 2))),
                     image=str(f["file_path"]),
                     passes=f.get("exr_path"),
                 )
             )
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
-        what = f"the entry {e} is missing" if isinstance(e, KeyError) else f"it is damaged ({e})"
-        raise InputError(f"{path}: {what}; render the Sequence again.") from None
-    _check(seq, path)
+    check_sequence(seq, path)
     return seq
 
 
-def _check(seq: Sequence, path: Path) -> None:
+@contextlib.contextmanager
+def read_from(path: Path, remedy: str = Sequence.remedy) -> Iterator[None]:
+    """What goes wrong inside while the JSON file `path` is taken apart is raised as an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as e:
+        what = f"the entry {e} is missing" if isinstance(e, KeyError) else f"it is damaged ({e})"
+        raise InputError(f"{path}: {what}; {remedy}.") from None
+
+
+def frame_number(value: float) -> float:
+    """A frame's number, int where it is whole. Raises ValueError for what is no finite number."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"the frame {value} is not finite")
+    return int(number) if number.is_integer() else number
+
+
+def focal_lengths(camera: dict, width: int) -> tuple[float, float]:
+    """fx, fy in pixels of a `width` pixels wide picture: as `fl_x` and `fl_y` say, or else the angle `camera_angle_x`
+    in radians, with square pixels. Raises KeyError where there is neither."""
+    if "fl_x" in camera:
+        return float(camera["fl_x"]), float(camera.get("fl_y", camera["fl_x"]))
+    if "camera_angle_x" not in camera:
+        raise KeyError("camera_angle_x")
+    fx = focal_from_fov(math.degrees(float(camera["camera_angle_x"])), width)
+    return fx, float(camera.get("fl_y", fx))
+
+
+def check_sequence(seq: Sequence, path: Path) -> None:
+    """Raises InputError naming the file `path`, which describes the Sequence in its folder, and the fault: see
+    `read_sequence`."""
     if seq.width < 1 or seq.height < 1 or seq.fps <= 0 or seq.frame_end < seq.frame_start or not seq.views:
-        raise InputError(f"{path}: size, fps, frame range or views are empty or negative; render it again.")
+        raise InputError(f"{path}: size, fps, frame range or views are empty or negative; {seq.remedy}.")
     s = seq.normalisation
     if not (s.scale > 0 and np.isfinite([s.scale, *s.translation]).all()):
-        raise InputError(f"{path}: the normalisation is not a finite positive scale; render it again.")
+        raise InputError(f"{path}: the normalisation is not a finite positive scale; {seq.remedy}.")
     root = path.parent.resolve()
     if seq.tracks:
-        _check_file(path, root, seq.tracks)
+        _check_file(seq, path, root, seq.tracks)
     for v in seq.views:
         name = v.image or "?"
         R = v.c2w[:3, :3] if v.c2w.shape == (4, 4) else None
@@ -422,13 +383,13 @@ def _check(seq: Sequence, path: Path) -> None:
         if not (v.fx > 0 and v.fy > 0 and np.isfinite([v.fx, v.fy, v.cx, v.cy]).all()):
             raise InputError(f"{path}: the focal length of {name} is not positive; correct it.")
         for rel in filter(None, (v.image, v.passes)):
-            _check_file(path, root, rel)
+            _check_file(seq, path, root, rel)
 
 
-def _check_file(path: Path, root: Path, relative: str) -> None:
+def _check_file(seq: Sequence, path: Path, root: Path, relative: str) -> None:
     """Raises InputError unless the file is there, and below the Sequence's folder `root`."""
     full = (path.parent / relative).resolve()
     if not full.is_relative_to(root):
         raise InputError(f"{path}: {relative} points outside of the Sequence's folder; correct it.")
     if not full.is_file():
-        raise InputError(f"{full}: the file is missing; render the Sequence again.")
+        raise InputError(f"{full}: the file is missing; {seq.remedy}.")

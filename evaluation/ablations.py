@@ -23,7 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from ..datagen.readers import open_sequence, sequences_in
+from ..datagen.sequence import InputError, Sequence
 from ..exit_codes import exit_code
 from . import protocol, runner
 from .cache import Cache, name_sequences
@@ -307,7 +308,7 @@ def objects(folder: Path, limit: int | None) -> dict[str, Sequence]:
     found = sequences_in(folder)[:limit]
     if not found:
         raise InputError(f"{folder}: no Sequence in it; render some with `timesplat render`.")
-    out = {n: read_sequence(f) for n, f in name_sequences(found).items()}
+    out = {n: open_sequence(f) for n, f in name_sequences(found).items()}
     for seq in out.values():
         protocol.held_out(seq)
     return out

@@ -15,8 +15,9 @@ from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
 from ..datagen.farm import render_assets
+from ..datagen.readers import name_of, open_sequence, sequences_in
 from ..datagen.render_job import RenderSettings
-from ..datagen.sequence import Sequence, read_sequence, sequences_in
+from ..datagen.sequence import Sequence
 from ..model.gaussians import FIELDS, Gaussians4D, ReconstructedScene
 from ..model.tracks import LOOKS, Paths, Tracks4D
 
@@ -46,7 +47,7 @@ class Cache:
 
             folder = self.folder / "renders" / settings.rig
             made, failures = render_assets(others, folder, settings, jobs=jobs, report=bar.write, progress=progress)
-        return found | {f.parent.name: read_sequence(f) for f in sorted(made)}, failures
+        return found | {f.parent.name: open_sequence(f) for f in sorted(made)}, failures
 
     # ---------------------------------------------------------------- rows
 
@@ -119,11 +120,11 @@ def find_sequences(assets: list[str]) -> tuple[dict[str, Sequence], list[str]]:
         found = sequences_in(Path(asset))
         folders += found
         others += [] if found else [asset]
-    return {n: read_sequence(f) for n, f in name_sequences(folders).items()}, others
+    return {n: open_sequence(f) for n, f in name_sequences(folders).items()}, others
 
 
 def name_sequences(folders: list[Path]) -> dict[str, Path]:
-    """{name: folder}: a Sequence is named by the folder above its clip's, with the clip where an object has several."""
-    objects = [f.parent.name for f in folders]
+    """{name: folder}: see `name_of`, with the clip where an object has several."""
+    objects = [name_of(f) for f in folders]
     names = [o if objects.count(o) == 1 else f"{o}/{f.name}" for o, f in zip(objects, folders, strict=True)]
     return dict(zip(names, folders, strict=True))

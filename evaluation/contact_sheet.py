@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..datagen.sequence import Sequence, read_sequence
+from ..datagen.readers import open_sequence
+from ..datagen.sequence import Sequence
 from ..exit_codes import exit_code
 from ..model.views import load_views
 from .figures import write_whole
@@ -25,7 +26,7 @@ from .pictures import grid
 def contact_sheet(seq: Sequence, frames: int):
     """-> PIL image: a row a camera, `frames` columns evenly spread over the clip."""
     chosen = np.unique(np.linspace(seq.frame_start, seq.frame_end, frames).round().astype(int))
-    cameras: dict[str, dict[int, int]] = {}
+    cameras: dict[str, dict[float, int]] = {}
     rigs: dict[str, set] = {}
     for v in seq.views:
         rigs.setdefault(v.camera, set()).add(v.rig)
@@ -83,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
 def write_contact_sheet(folder: Path, out: Path, frames: int) -> None:
     """The contact sheet of the Sequence in a folder as a .png, whole or not at all. Raises InputError."""
     data = io.BytesIO()
-    contact_sheet(read_sequence(folder), frames).save(data, "PNG", optimize=True)
+    contact_sheet(open_sequence(folder), frames).save(data, "PNG", optimize=True)
     write_whole(out, data.getvalue())
     print(out)
 

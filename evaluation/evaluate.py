@@ -48,7 +48,8 @@ class EvaluateOptions:
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """The arguments of `timesplat evaluate`."""
     d = EvaluateOptions([], Path())
-    p.add_argument("assets", nargs="+", help="animated files, zoo:SEED, rendered Sequences, or folders of either")
+    p.add_argument("assets", nargs="+", help="animated files, zoo:SEED, rendered Sequences, scenes in the "
+                   "format of D-NeRF, or folders of these")  # fmt: skip
     p.add_argument("--setup", default=d.setup, help="comma-separated: alternating, interpolation, rotating, "
                    "random (all: these four), video, canonical, random-N, views-N, split: all views but those held "
                    "out, scored on those of --split (default: %(default)s)")  # fmt: skip
@@ -137,7 +138,7 @@ def plan(
             inputs = protocol.inputs(seq, setup) if setup else protocol.all_inputs(seq)
             for size, stride in sizes.items():
                 scored = protocol.held_out(seq, split) if setup == "split" else protocol.targets(seq)
-                targets = [i for i in scored if (seq.views[i].frame - seq.frame_start) % stride == 0]
+                targets = [i for i in scored if protocol.is_scored(seq, i, stride)]
                 labels = {"setup": setup, "stride": stride}
                 at = (tuple(inputs), tuple(targets), size, labels)
                 runs += [Run(name, seq.folder, m, *at) for m in methods if (m.method, setup) not in NOT_FOR]

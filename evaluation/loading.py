@@ -10,10 +10,9 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from ..datagen.sequence import InputError, Sequence, read_sequence
-from ..model.training.dataset import shrink
+from ..datagen.readers import open_sequence
+from ..datagen.sequence import Sequence
 from ..model.views import Views, load_views
 from .flip import features
 
@@ -34,34 +33,11 @@ class Truth:
         return self.seen[i]
 
 
-def load_inputs(seq: Sequence, indices: Indices[int], has_depth: bool, size: int | None = None) -> Views:
-    """Views at `size` pixels, a whole fraction of what was rendered (all of it by default), with depth and flow where
-    `has_depth`. Raises InputError."""
-    by = _fraction(seq, size)
-    views = load_views(seq, indices, has_depth)
-    if has_depth or by == 1:
-        return shrink(views, by)
-    still = views.alpha.new_zeros(()).expand(*views.alpha.shape, 4)
-    return without_depth(shrink(replace(views, depth=torch.full_like(views.alpha, torch.inf), flow=still), by))
-
-
 def load_truth(seq: Sequence, targets: Indices[int], novel: Indices[int], size: int | None = None) -> Truth:
-    """The views `targets` at `size` pixels as truth; `novel` are those of them that no input shows."""
-    views = load_views(seq, targets)
-    picture, by = views.over(), _fraction(seq, size)
-    if by > 1:  # over white first: then light is averaged, and nothing else is to be weighted
-        picture = avg_pool2d(picture.movedim(-1, 1), by).movedim(1, -1).contiguous()
-        alpha = avg_pool2d(views.alpha[:, None], by)[:, 0]
-        views = replace(views, rgb=picture, alpha=alpha, intrinsics=views.intrinsics / by)
-    chosen = set(novel)
-    return Truth(views, picture, torch.tensor([i in chosen for i in targets]))
-
-
-def _fraction(seq: Sequence, size: int | None) -> int:
-    by = seq.width // (size or seq.width)
-    if by < 1 or (size and (size * by != seq.width or seq.height % by)):
-        raise InputError(f"{seq.root}: {seq.width}x{seq.height} pixels do not shrink to {size}; give a whole fraction.")
-    return by
+    """The views `targets` at `size` pixels as truth; `novel` are those of them that no input shows. Light is averaged
+    where they are made smaller, so that laid on white before or after is the same."""
+    views, chosen = load_views(seq, targets, size=size), set(novel)
+    return Truth(views, views.over(), torch.tensor([i in chosen for i in targets]))
 
 
 def without_depth(views: Views) -> Views:
@@ -87,11 +63,11 @@ def thinned(views: Views, step: int) -> Views:
 
 @lru_cache(maxsize=2)
 def kept_inputs(folder: Path, indices: tuple[int, ...], has_depth: bool, size: int) -> Views:
-    """`load_inputs` of the Sequence in a folder; the last two are kept, for methods come one after another on them."""
-    return load_inputs(read_sequence(folder), indices, has_depth, size)
+    """`load_views` of the Sequence in a folder; the last two are kept, for methods come one after another on them."""
+    return load_views(open_sequence(folder), indices, has_depth, size)
 
 
 @lru_cache(maxsize=4)
 def kept_truth(folder: Path, targets: tuple[int, ...], novel: tuple[int, ...], size: int) -> Truth:
     """`load_truth` of the Sequence in a folder; the last four are kept."""
-    return load_truth(read_sequence(folder), targets, novel, size)
+    return load_truth(open_sequence(folder), targets, novel, size)

@@ -64,7 +64,7 @@ def inputs(seq: Sequence, setup: str) -> list[int]:
         frame, camera, _ = lacking[0]
         raise InputError(
             f"{seq.root}: no view from camera {camera} at frame {frame}, which the setup {setup} needs; "
-            "render it with --rig evaluation --targets 1."
+            "render it with --rig evaluation --targets 1, or take the setup split."
         )
     return [place[w] for w in wanted]
 
@@ -120,17 +120,22 @@ def targets(seq: Sequence, stride: int = 1) -> list[int]:
     Raises InputError where there is nothing to score."""
     if stride < 1:
         raise InputError(f"--stride {stride}: give 1 or more.")
-    kept = range(seq.frame_start, seq.frame_end + 1, stride)
-    scored = [i for i in seq.select(rig="canonical") + seq.select(rig="target") if seq.views[i].frame in kept]
+    scored = [i for i in seq.select(rig="canonical") + seq.select(rig="target") if is_scored(seq, i, stride)]
     if not scored:
         raise InputError(f"{seq.root}: no held-out views to score; render it with --targets 1.")
     return _in_time(seq, scored)
 
 
+def is_scored(seq: Sequence, index: int, stride: int) -> bool:
+    """Whether a view is of every `stride`-th frame of the clip from the first on, or between it and the next frame."""
+    frame = seq.views[index].frame
+    return seq.frame_start <= frame <= seq.frame_end and (frame - seq.frame_start) // 1 % stride == 0
+
+
 def novel(seq: Sequence, inputs: list[int], targets: list[int]) -> list[int]:
     """Those targets that no input shows: no input view has the same moment and the same camera pose (rotating
     cameras start and end in canonical poses)."""
-    seen: dict[int, list[np.ndarray]] = {}
+    seen: dict[float, list[np.ndarray]] = {}
     for i in inputs:
         seen.setdefault(seq.views[i].frame, []).append(seq.views[i].c2w)
     views = ((i, seq.views[i]) for i in targets)

@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ..datagen.sequence import read_sequence
+from ..datagen.readers import described_by, open_sequence
 from ..model.views import load_views
 from . import protocol
 from .cache import Cache
@@ -69,7 +69,7 @@ def key_of(run: Run, conditions: Conditions) -> str:
 
 
 def _sequence_hash(folder: Path) -> str:
-    return file_hash(folder / "transforms.json")
+    return "".join(file_hash(path) for path in described_by(folder))
 
 
 def run_all(runs: list[Run], cache: Cache, conditions: Conditions, description: str = "evaluating") -> list[dict]:
@@ -146,7 +146,7 @@ def _work(job: tuple[str, Run]) -> dict | None:
 def score_run(run: Run, conditions: Conditions, cache: Cache, key: str, load_depth: bool) -> dict:
     """`evaluate_views` of a run, with `costs` where they are asked for; its scene is kept where that is. load_depth:
     whether other runs will want the depth of the same views."""
-    seq = read_sequence(run.folder)
+    seq = open_sequence(run.folder)
     load_depth = load_depth and all(seq.views[i].passes for i in run.inputs)
     views = kept_inputs(run.folder, run.inputs, load_depth or run.method.has_depth, run.size)
     views = thinned(views if run.method.has_depth else without_depth(views), run.step)
@@ -166,9 +166,9 @@ def warm_up(run: Run, methods: list[MethodSpec], device: str = "cpu") -> None:
     """Every kind of method once on two views of a run, so that no timing holds the compilation of kernels (about
     fifteen seconds, the first time on a machine) or imports."""
     kinds = {(m.method, m.checkpoint, bool(m.refine), bool(m.budget)): m for m in methods}
-    seq = read_sequence(run.folder)
+    seq = open_sequence(run.folder)
     for method in kinds.values():
-        views = load_views(seq, run.inputs[:2], method.has_depth)
+        views = load_views(seq, run.inputs[:2], method.has_depth, run.size)
         brief = replace(method, refine=method.refine and WARM_UP_SECONDS, seconds=WARM_UP_SECONDS)
         draw(reconstruct(views, brief, device), views[:1])
 

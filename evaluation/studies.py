@@ -291,7 +291,7 @@ def pictures(options: StudyOptions) -> None:
         rows = {"truth": truth.picture}
         for m in tqdm(options.methods, desc=name, unit="method", disable=None):
             rows[m.label] = draw(scene_of(options, seq, chosen, m), truth.views)[0]
-        frames = [f"frame {seq.views[i].frame}" for i in shown]
+        frames = [f"frame {seq.views[i].frame:g}" for i in shown]
         stem = options.out / f"pictures-{name.replace('/', '-')}-{options.setup}"
         save_picture(grid(rows, frames), stem, options.made_by.caption)
 

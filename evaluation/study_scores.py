@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datagen.sequence import InputError, Sequence, read_sequence, sequences_in
+from ..datagen.readers import open_sequence, sequences_in
+from ..datagen.sequence import InputError, Sequence
+from ..model.views import load_views
 from . import protocol
 from .cache import Cache, name_sequences
-from .loading import load_inputs
 from .method_spec import MethodSpec
 from .metrics import METRICS
 from .provenance import Provenance
@@ -42,7 +43,7 @@ class StudyOptions:
 
 def scene_of(options: StudyOptions, seq: Sequence, chosen: list[int], method: MethodSpec):
     """The scene that a method makes of some views, without what the inference filters would never draw."""
-    scene = reconstruct(load_inputs(seq, chosen, method.has_depth, options.size), method, options.device)
+    scene = reconstruct(load_views(seq, chosen, method.has_depth, options.size), method, options.device)
     return scene[scene.alive()]
 
 
@@ -51,7 +52,7 @@ def subjects(folders: list[Path], size: int) -> dict[str, Sequence]:
     found = sorted({p for f in folders for p in sequences_in(f)})
     if not found:
         raise InputError(f"{folders[0]}: no Sequence in it; {protocol.RENDER}.")
-    out = {n: read_sequence(f) for n, f in name_sequences(found).items()}
+    out = {n: open_sequence(f) for n, f in name_sequences(found).items()}
     for seq in out.values():
         if seq.width != seq.height or size < 1 or seq.width % size:
             raise InputError(f"{seq.root}: {seq.width}x{seq.height} pixels cannot be shrunk to {size}; choose --size.")

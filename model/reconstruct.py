@@ -44,19 +44,20 @@ def reconstruct(
     indices=None,
     options: ReconstructOptions = DEFAULTS,
     progress: Progress | None = None,
+    size: int | None = None,
 ) -> Gaussians4D | ReconstructedScene:
-    """Views `indices` of the Sequence (all of them by default), by a method (`default_method` where none is named) ->
-    the scene (N,), Gaussians filtered out that the paper's inference filters would never draw. `progress(fraction,
-    text)` is called between steps.
+    """Views `indices` of the Sequence (all of them by default), at `size` pixels (see `load_views`), by a method
+    (`default_method` where none is named) -> the scene (N,), Gaussians filtered out that the paper's inference filters
+    would never draw. `progress(fraction, text)` is called between steps.
 
-    Raises InputError for an unknown method, missing passes, a damaged image or checkpoint, and a device that cannot
-    be used."""
+    Raises InputError for an unknown method, missing passes, a damaged image or checkpoint, a size that is no whole
+    fraction, and a device that cannot be used."""
     report = progress or (lambda fraction, text: None)
     method = chosen_method(sequence, method, indices)
     has_depth = method_named(method).has_depth
     report(0.0, "reading views")
     indices = range(len(sequence.views)) if indices is None else indices
-    views = load_views(sequence, indices, has_depth=has_depth)
+    views = load_views(sequence, indices, has_depth, size)
     if not (views.alpha > 0.5).any():
         raise InputError(f"{sequence.root}: no view shows the object; check the cameras and the alpha channel.")
     report(0.3, f"reconstructing ({method})")

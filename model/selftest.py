@@ -19,16 +19,15 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from ..datagen.passes import Passes, write_passes
 from ..datagen.rigs import Shot, alternating, spherical
 from ..datagen.sequence import (
     InputError,
-    Passes,
     Sequence,
     View,
     focal_from_fov,
     opengl_to_opencv,
     read_sequence,
-    write_passes,
     write_sequence,
 )
 

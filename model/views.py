@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as Indices
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..datagen.sequence import Sequence
+from ..datagen.sequence import InputError, Sequence
 from ..datagen.track_file import SurfaceTracks
 
 BACKGROUND = 1.0  # white: what pictures are laid on where nothing else is said
@@ -52,26 +53,67 @@ class Views:
         return self.rgb * a + background * (1 - a)
 
 
-def load_views(seq: Sequence, indices, has_depth: bool = False) -> Views:
+def load_views(seq: Sequence, indices: Indices[int], has_depth: bool = False, size: int | None = None) -> Views:
     """The views of a Sequence at `indices`, has_depth: with depth and flow, and the surface's tracks where it has them.
-    Raises InputError for a missing or damaged image, pass or file of tracks."""
-    rgba = torch.from_numpy(np.stack([seq.load_image(i) for i in indices])).float() / 255
-    c2w, intrinsics = seq.cameras(indices)
-    views = Views(
-        rgb=rgba[..., :3],
-        alpha=rgba[..., 3],
-        c2w=torch.from_numpy(c2w),
-        intrinsics=torch.from_numpy(intrinsics),
-        time=torch.from_numpy(seq.times(indices)),
-        frame_step=2 / max(seq.frame_end - seq.frame_start, 1),
-    )
+    size: pixels of the longer side, a whole fraction of what the Sequence has, which is the default; each view is made
+    smaller as it is read. Raises InputError for a missing or damaged image, pass or file of tracks, and for a size that
+    is no whole fraction."""
+    by = shrink_factor(seq, size)
+    parts = [shrink(_load_view(seq, i, has_depth), by) for i in indices]
+    tensors = {k.name: [getattr(p, k.name) for p in parts] for k in fields(Views)}
+    joined = {k: torch.cat(x) for k, x in tensors.items() if isinstance(x[0], Tensor)}
+    views = Views(**joined, frame_step=2 / max(seq.frame_end - seq.frame_start, 1))
     if has_depth:
-        p = [seq.load_passes(i) for i in indices]
-        views.depth = torch.from_numpy(np.stack([x.depth for x in p]))
-        views.flow = torch.from_numpy(np.stack([np.concatenate([x.flow_next, x.flow_prev], -1) for x in p]))
         views.surface = seq.load_tracks() if seq.tracks else None
         views.untracked = bool(seq.untracked)
     return views
+
+
+def _load_view(seq: Sequence, index: int, has_depth: bool) -> Views:
+    rgba = torch.tensor(seq.load_image(index), dtype=torch.float32)[None] / 255
+    c2w, intrinsics = (torch.from_numpy(x) for x in seq.cameras([index]))
+    view = Views(rgba[..., :3], rgba[..., 3], c2w, intrinsics, torch.from_numpy(seq.times([index])), 0.0)
+    if has_depth:
+        p = seq.load_passes(index)
+        view.depth = torch.from_numpy(p.depth)[None]
+        view.flow = torch.from_numpy(np.concatenate([p.flow_next, p.flow_prev], -1))[None]
+    return view
+
+
+def shrink_factor(seq: Sequence, size: int | None) -> int:
+    """How many times smaller the pictures of a Sequence are when their longer side has `size` pixels; 1 for None.
+    Raises InputError where it is no whole number, or does not fit both sides."""
+    side = max(seq.width, seq.height)
+    by = side // size if size and size > 0 else int(size is None)
+    if by < 1 or (size and size * by != side) or seq.width % by or seq.height % by:
+        raise InputError(f"{seq.root}: {seq.width}x{seq.height} pixels do not shrink to {size}; give a whole fraction.")
+    return by
+
+
+def shrink(views: Views, by: int) -> Views:
+    """The views at 1/by of their size: colours and alpha are averaged as light is, depth and motion, if known, over
+    the surface nearest to the camera in each block."""
+    if by == 1:
+        return views
+    height, width = (n // by for n in views.size)
+
+    def blocks(x: Tensor) -> Tensor:  # (V,H,W,C) -> (V,h,w,by²,C)
+        x = x[:, : height * by, : width * by].reshape(len(views), height, by, width, by, -1)
+        return x.transpose(2, 3).flatten(3, 4)
+
+    alpha = blocks(views.alpha[..., None])
+    total = alpha.mean(3)
+    rgb = (blocks(views.rgb) * alpha).mean(3) / total.clamp_min(1e-6)
+    small = replace(views, rgb=rgb, alpha=total[..., 0], intrinsics=views.intrinsics / by, depth=None, flow=None)
+    if views.depth is None or views.flow is None:
+        return small
+    depth, flow = blocks(views.depth[..., None]), blocks(views.flow)
+    near = depth <= depth.amin(3, keepdim=True) + 0.05
+    near &= torch.isfinite(depth)
+    count = near.sum(3)
+    mean = (torch.where(near, depth, 0.0).sum(3) / count.clamp_min(1))[..., 0]
+    flow = torch.where(near, flow, 0.0).sum(3) / count.clamp_min(1) / by
+    return replace(small, depth=torch.where(count[..., 0] > 0, mean, torch.inf), flow=flow)
 
 
 def pad_to_multiple(views: Views, multiple: int) -> Views:

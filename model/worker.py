@@ -48,7 +48,8 @@ from typing import TextIO
 
 import numpy as np
 
-from ..datagen.sequence import InputError, read_sequence
+from ..datagen.readers import open_sequence
+from ..datagen.sequence import InputError
 
 _KINDS = {"text": str, "number": (int, float), "true or false": bool, "list": list}
 _KEYS = {
@@ -96,7 +97,7 @@ def main(argv: list[str]) -> int:
 
 def _reconstruct(request: dict, progress) -> dict:
     progress(0.0, "starting")
-    sequence = read_sequence(Path(request["sequence"]))
+    sequence = open_sequence(Path(request["sequence"]))
     views, indices = len(sequence.views), request.get("indices")
     for i in indices or []:
         if type(i) is not int or not 0 <= i < views:

@@ -108,7 +108,8 @@ def write_views():
     import torch
     from PIL import Image
 
-    from timesplat.datagen.sequence import Passes, Sequence, View, opengl_to_opencv, write_passes, write_sequence
+    from timesplat.datagen.passes import Passes, write_passes
+    from timesplat.datagen.sequence import Sequence, View, opengl_to_opencv, write_sequence
 
     def write(views, folder, targets=None):
         height, width = views.size

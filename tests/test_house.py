@@ -63,9 +63,10 @@ LAYERS = {
         ("addon",),
     ),
     "datagen": (
-        ("datagen.image_files", "datagen.rigs", "datagen.track_file"),
-        ("datagen.outside", "datagen.spread", "datagen.moving_frames"),
+        ("datagen.errors", "datagen.image_files", "datagen.rigs", "datagen.track_file"),
+        ("datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
         ("datagen.sequence",),
+        ("datagen.readers",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.render_setup", "datagen.tracks"),
         ("datagen.capture",),
@@ -84,6 +85,8 @@ LAYERS = {
         ("benchmarks.rasterizer_cuda",),
     ),
 }
+# What `model` knows of `datagen`: how views are read and written, none of what renders them.
+MODEL_READS = {"datagen.passes", "datagen.readers", "datagen.rigs", "datagen.sequence", "datagen.track_file"}
 # What the product, all of `model` but these, does not know; they may use every layer up to the one named.
 ASIDE = {"model.baselines": "model.methods", "model.training": "model.inference"}
 
@@ -142,7 +145,7 @@ def test_wings(name):
     if wing == "datagen":
         assert all(within(r, "datagen") for r in told)
     if wing == "model":
-        assert {r for r in told if not within(r, "model")} <= {"datagen.sequence", "datagen.rigs", "datagen.track_file"}
+        assert {r for r in told if not within(r, "model")} <= MODEL_READS
     if wing == "addon":
         others = {r for r in told if not within(r, "addon") and not within(r, "datagen")}
         assert all(within(r, "model.io") for r in others)

@@ -9,7 +9,8 @@ from hypothesis.extra import numpy as hnp
 
 from timesplat.datagen import image_files, rigs
 from timesplat.datagen import sequence as sq
-from timesplat.datagen.sequence import InputError, Normalisation, Passes, Sequence, View, sequences_in
+from timesplat.datagen.passes import Passes, write_passes
+from timesplat.datagen.sequence import InputError, Normalisation, Sequence, View
 
 
 def make(folder, frames=3, size=(6, 4), passes=True, provenance=None):
@@ -26,7 +27,7 @@ def make(folder, frames=3, size=(6, 4), passes=True, provenance=None):
                 v.passes = f"{i}.exr"
                 depth = rng.random((h, w), np.float32) + 2
                 depth[0] = np.inf
-                sq.write_passes(tmp / v.passes, Passes(depth, *rng.normal(size=(2, h, w, 2))))
+                write_passes(tmp / v.passes, Passes(depth, *rng.normal(size=(2, h, w, 2))))
 
     return sq.write_sequence(seq, folder, fill)
 
@@ -122,16 +123,6 @@ def test_damage_is_named(tmp_path, case):
     sentence(e, str(tmp_path / "a"), word)
 
 
-def test_found_at_any_depth_but_only_when_finished(tmp_path):
-    for name in ("b/walk", "a", "a/deeper/run", ".c.x7/half", "b/.walk.y8", "empty"):
-        (tmp_path / name).mkdir(parents=True)
-        if name != "empty":
-            (tmp_path / name / "transforms.json").touch()
-    assert sequences_in(tmp_path) == [tmp_path / name for name in ("a", "a/deeper/run", "b/walk")]
-    assert sequences_in(tmp_path / "b" / "walk") == [tmp_path / "b" / "walk"]
-    assert sequences_in(tmp_path / "nowhere") == []
-
-
 def test_missing_folder_is_named(tmp_path):
     with pytest.raises(InputError) as e:
         sq.read_sequence(tmp_path / "nothing")
@@ -154,8 +145,8 @@ def test_damaged_passes_are_named(tmp_path):
     folder = tmp_path / "a"
     (folder / "0.exr").write_bytes((folder / "0.exr").read_bytes()[:200])
     image_files.write_exr(folder / "1.exr", {"Z": np.zeros((4, 6), np.float32)})
-    sq.write_passes(folder / "2.exr", Passes(np.ones((2, 2)), *np.zeros((2, 2, 2, 2))))
-    sq.write_passes(folder / "3.exr", Passes(np.full((4, 6), np.nan), *np.zeros((2, 4, 6, 2))))
+    write_passes(folder / "2.exr", Passes(np.ones((2, 2)), *np.zeros((2, 2, 2, 2))))
+    write_passes(folder / "3.exr", Passes(np.full((4, 6), np.nan), *np.zeros((2, 4, 6, 2))))
     (folder / "4.exr").unlink()
     for i, word in enumerate(("cannot be read", "channel", "2x2", "NaN", "is missing")):
         with pytest.raises(InputError) as e:

@@ -6,8 +6,9 @@ import torch
 
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.evaluation import protocol
-from timesplat.evaluation.loading import collapsed, load_inputs, load_truth, thinned
+from timesplat.evaluation.loading import collapsed, load_truth, thinned
 from timesplat.model.geometry.lift import lift
+from timesplat.model.views import load_views
 
 
 def test_smaller_sizes_are_averages(sphere_folder):
@@ -18,11 +19,11 @@ def test_smaller_sizes_are_averages(sphere_folder):
     blocks = truth.picture.reshape(6, 16, 2, 16, 2, 3).mean((2, 4))
     assert torch.allclose(half.picture, blocks, atol=1e-6)
     assert torch.allclose(half.views.intrinsics * 2, truth.views.intrinsics)
-    has_depth, without = (load_inputs(seq, range(24), depth, 16) for depth in (True, False))
+    has_depth, without = (load_views(seq, range(24), depth, 16) for depth in (True, False))
     assert torch.equal(has_depth.rgb, without.rgb) and without.depth is None and has_depth.depth is not None
     assert torch.allclose(without.over(1.0), load_truth(seq, range(24), [], 16).picture, atol=1e-5)
     with pytest.raises(InputError, match="do not shrink to 20"):
-        load_inputs(seq, range(24), False, 20)
+        load_views(seq, range(24), False, 20)
 
 
 def test_a_thinned_clip_moves_at_the_same_speed(spheres):
@@ -34,5 +35,5 @@ def test_a_thinned_clip_moves_at_the_same_speed(spheres):
 
 def test_one_moment_is_reconstructed_still(evaluation_folder):
     seq = read_sequence(evaluation_folder)
-    g = lift(collapsed(load_inputs(seq, protocol.at_frame(seq, 12, "canonical"), True)))
+    g = lift(collapsed(load_views(seq, protocol.at_frame(seq, 12, "canonical"), True)))
     assert (g.velocity == 0).all() and (g.t == 0).all() and len(g) > 100

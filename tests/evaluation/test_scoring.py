@@ -7,7 +7,7 @@ import torch
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.evaluation import protocol, scoring
 from timesplat.evaluation.image_quality import psnr
-from timesplat.evaluation.loading import load_inputs, load_truth
+from timesplat.evaluation.loading import load_truth
 from timesplat.evaluation.method_spec import parse_spec
 from timesplat.evaluation.scoring import COSTS, costs, draw, evaluate_views
 from timesplat.model.views import load_views
@@ -25,7 +25,7 @@ def evaluated(seq):
 
     def run(text):
         spec = parse_spec(text)
-        return evaluate_views(load_inputs(seq, range(24), spec.has_depth), spec, load_truth(seq, targets, targets))
+        return evaluate_views(load_views(seq, range(24), spec.has_depth), spec, load_truth(seq, targets, targets))
 
     return run
 
@@ -82,7 +82,7 @@ def test_the_device_reaches_the_method(evaluated, seq, monkeypatch):
     plain = scoring.reconstruct_views
     monkeypatch.setattr(scoring, "reconstruct_views", lambda v, m, options: got.append(options.device) or plain(v, m))
     targets = protocol.held_out(seq)
-    views, truth = load_inputs(seq, range(4), True), load_truth(seq, targets, targets)
+    views, truth = load_views(seq, range(4), True), load_truth(seq, targets, targets)
     evaluate_views(views, parse_spec("lift"), truth, device="cuda:1")
     assert got == ["cuda:1"]
 
@@ -92,7 +92,7 @@ def test_what_a_scene_costs(seq, evaluated):
     truth = load_truth(seq, targets, targets)
     for text, covered in (("lift", True), ("lift+budget:500", False)):
         spec = parse_spec(text)
-        found = costs(evaluated("lift")[1], load_inputs(seq, range(24), True), truth, spec, seq)
+        found = costs(evaluated("lift")[1], load_views(seq, range(24), True), truth, spec, seq)
         assert tuple(found) == COSTS and (found["coverage"] is not None) == covered
         assert found["ply_mb"] > 0.01 and found["render_ms"] > 0
 

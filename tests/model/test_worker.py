@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from timesplat.datagen.sequence import Passes, Sequence, View, focal_from_fov, opengl_to_opencv, write_passes
+from timesplat.datagen.passes import Passes, write_passes
+from timesplat.datagen.sequence import Sequence, View, focal_from_fov, opengl_to_opencv
 from timesplat.datagen.sequence import write_sequence as write
 from timesplat.model.io.asset import ARRAYS, Asset, Clip
 from timesplat.model.io.ply import read_ply, write_ply

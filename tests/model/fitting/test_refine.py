@@ -8,7 +8,7 @@ import torch
 
 from timesplat.cli import main
 from timesplat.datagen.sequence import InputError, read_sequence
-from timesplat.evaluation.loading import load_inputs, load_truth
+from timesplat.evaluation.loading import load_truth
 from timesplat.evaluation.method_spec import parse_spec
 from timesplat.evaluation.scoring import evaluate_views
 from timesplat.model.fitting.fit_views import squared_error
@@ -16,6 +16,7 @@ from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB, Few, part, refi
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
 from timesplat.model.io.ply import read_ply
+from timesplat.model.views import load_views
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +112,6 @@ def test_from_the_command_line_and_in_the_tables(scene, write_views, tmp_path, c
     seq = read_sequence(folder)
     chosen = [i for i, v in enumerate(seq.views) if v.rig != "target"]
     targets = [i for i, v in enumerate(seq.views) if v.rig == "target"]
-    views, truth = load_inputs(seq, chosen, False), load_truth(seq, targets, targets)
+    views, truth = load_views(seq, chosen, False), load_truth(seq, targets, targets)
     row = {m: evaluate_views(views, parse_spec(m), truth)[0]["psnr"] for m in ("hull", "hull+refine:1")}
     assert row["hull+refine:1"] > row["hull"]
