@@ -124,7 +124,10 @@ def find_sequences(assets: list[str]) -> tuple[dict[str, Sequence], list[str]]:
 
 
 def name_sequences(folders: list[Path]) -> dict[str, Path]:
-    """{name: folder}: see `name_of`, with the clip where an object has several."""
+    """{name: folder}: see `name_of`; with the folder above where several are called so, as an object's clips are."""
     objects = [name_of(f) for f in folders]
-    names = [o if objects.count(o) == 1 else f"{o}/{f.name}" for o, f in zip(objects, folders, strict=True)]
+    names = [
+        o if objects.count(o) == 1 else f"{f.absolute().parent.name}/{f.name}"
+        for o, f in zip(objects, folders, strict=True)
+    ]
     return dict(zip(names, folders, strict=True))

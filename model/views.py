@@ -59,10 +59,13 @@ def load_views(seq: Sequence, indices: Indices[int], has_depth: bool = False, si
     smaller as it is read. Raises InputError for a missing or damaged image, pass or file of tracks, and for a size that
     is no whole fraction."""
     by = shrink_factor(seq, size)
-    parts = [shrink(_load_view(seq, i, has_depth), by) for i in indices]
-    tensors = {k.name: [getattr(p, k.name) for p in parts] for k in fields(Views)}
-    joined = {k: torch.cat(x) for k, x in tensors.items() if isinstance(x[0], Tensor)}
-    views = Views(**joined, frame_step=2 / max(seq.frame_end - seq.frame_start, 1))
+    tensors: dict[str, Tensor] = {}
+    for n, i in enumerate(indices):
+        view = vars(shrink(_load_view(seq, i, has_depth), by))
+        for k, x in view.items():
+            if isinstance(x, Tensor):  # room for all views at once: pieces between large pictures would hold memory
+                tensors.setdefault(k, x.new_empty(len(indices), *x.shape[1:]))[n] = x[0]
+    views = Views(**tensors, frame_step=2 / max(seq.frame_end - seq.frame_start, 1))
     if has_depth:
         views.surface = seq.load_tracks() if seq.tracks else None
         views.untracked = bool(seq.untracked)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The one door to Sequences on disk, whoever wrote them: which of the readers a folder is for. No torch."""
+"""The one door to Sequences on disk, whoever wrote them: which of the readers a folder is for. Without torch."""
 
 from __future__ import annotations
 

@@ -75,6 +75,65 @@ def test_normalisation_there_and_back(translation, scale, azimuth, elevation):
     assert np.allclose(back, c2w, atol=1e-6) and np.array_equal(back[:3, :3], c2w[:3, :3])
 
 
+def changed(folder, change):
+    """The Sequence of three frames in a folder after a change of its JSON."""
+    broken(folder, change)
+    return sq.read_sequence(folder)
+
+
+def test_fractions_of_a_frame_are_kept_and_whole_ones_are_whole(tmp_path):
+    def between(d):
+        for f, frame in zip(d["frames"], (0, 0.5, 2.0), strict=True):
+            f["frame"] = frame
+
+    seq = changed(tmp_path / "a", between)
+    assert [v.frame for v in seq.views] == [0, 0.5, 2] and type(seq.views[2].frame) is int
+    assert seq.times().tolist() == [-1, -0.5, 1] and seq.select(frame=0.5) == [1]
+
+
+def test_a_sequence_written_again_is_the_same_file(tmp_path):
+    seq = make(tmp_path / "a")
+
+    def again(tmp):
+        for v in seq.views:
+            for name in (v.image, v.passes):
+                (tmp / name).write_bytes((tmp_path / "a" / name).read_bytes())
+
+    sq.write_sequence(seq, tmp_path / "b", again)
+    assert (tmp_path / "a" / "transforms.json").read_bytes() == (tmp_path / "b" / "transforms.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("frames", "stated", "clip"),
+    [
+        ((0, 5, 11), {}, (0, 11)),
+        ((3, 3, 3), {}, (3, 3)),
+        ((0.5, 1.5, 2.5), {}, (0, 3)),
+        ((4, 5, 6), {"frame_end": 8}, (4, 8)),
+        ((4, 5, 6), {"frame_start": 1}, (1, 6)),
+    ],
+)
+def test_without_a_range_it_is_that_of_the_frames(tmp_path, frames, stated, clip):
+    def change(d):
+        del d["frame_start"], d["frame_end"]
+        d.update(stated)
+        for f, frame in zip(d["frames"], frames, strict=True):
+            f["frame"] = frame
+
+    seq = changed(tmp_path / "a", change)
+    assert (seq.frame_start, seq.frame_end) == clip and (len(set(frames)) == 1 or len(set(seq.times().tolist())) == 3)
+
+
+def test_an_angle_is_enough(tmp_path):
+    def change(d):
+        d["camera_angle_x"] = 2 * np.arctan(6 / 2 / 7)
+        for f in d["frames"]:
+            del f["fl_x"], f["fl_y"]
+
+    seq = changed(tmp_path / "a", change)
+    assert all(v.fx == v.fy == pytest.approx(7) for v in seq.views)
+
+
 # ---------------------------------------------------------------- what can be wrong
 
 
@@ -107,6 +166,9 @@ WRONG = {
         lambda d: d["frames"][0].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()),
         "not a rotation",
     ),
+    "frame missing": (lambda d: d["frames"][1].pop("frame") and None, "'frame' is missing"),
+    "frame NaN": (lambda d: d["frames"][1].update(frame=float("nan")), "the frame nan is not finite"),
+    "no focal": (lambda d: [f.pop("fl_x") for f in d["frames"]] and None, "'camera_angle_x' is missing"),
     "focal 0": (lambda d: d["frames"][2].update(fl_x=0), "focal"),
     "image outside": (lambda d: d["frames"][0].update(file_path="../../etc/passwd"), "outside"),
     "image missing": (lambda d: d["frames"][0].update(file_path="no.png"), "missing"),

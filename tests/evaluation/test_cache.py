@@ -7,7 +7,7 @@ import shutil
 import torch
 
 from timesplat.datagen.sequence import read_sequence
-from timesplat.evaluation.cache import Cache, find_sequences
+from timesplat.evaluation.cache import Cache, find_sequences, name_sequences
 from timesplat.model.gaussians import FIELDS
 from timesplat.model.reconstruct import reconstruct
 
@@ -17,6 +17,8 @@ def test_finished_sequences_are_found(folders, tmp_path):
     assert list(sequences) == ["a", "b"] and others == ["fox.glb"]
     shutil.copytree(folders / "a" / "line", folders / "a" / "turn")
     assert list(find_sequences([str(folders)])[0]) == ["a/line", "a/turn", "b"]
+    others = [folders / "x" / "jump", folders / "y" / "jump", folders / "b"]
+    assert list(name_sequences(others)) == ["x/jump", "y/jump", "b"]
 
 
 def test_a_line_that_was_cut_off_is_left_out_and_ended(tmp_path):

@@ -53,6 +53,14 @@ def test_the_paper_scores_five_views_a_frame_and_novel_ones_are_not_inputs():
     assert {seq.views[i].frame for i in protocol.targets(seq, stride=4)} == set(range(3, 27, 4))
 
 
+def test_moments_between_frames_are_scored_with_the_frame_before():
+    seq = sequence("alternating", frames=8, first=0)
+    for i in seq.select(rig="target"):
+        seq.views[i].frame += 0.5
+    assert len(protocol.targets(seq)) == 8
+    assert [seq.views[i].frame for i in protocol.targets(seq, stride=4)] == [0.5, 4.5]
+
+
 @pytest.mark.parametrize("count", [4, 8, 12, 24, 36, 48, 96])
 def test_spread_views_are_even(count):
     chosen = protocol.inputs(seq := sequence(), f"views-{count}")
