@@ -144,6 +144,7 @@ def shape_of_motion(
             views,
             loss,
             Schedule(seconds=seconds - (work_clock() - start), steps=steps, seed=seed),
+            generator=generator,
             text="som",
             progress=progress,
         )
