@@ -73,17 +73,24 @@ def reconstruct_views(
     chosen = method_named(method)
     if chosen.checkpoint and not options.checkpoint:
         options = replace(options, checkpoint=CHECKPOINTS / f"{chosen.checkpoint}.safetensors")
-    if chosen.budgets or not (options.refine or options.budget):
+    counted = options.counted and not chosen.fits  # those that fit a scene have taken these steps by then
+    if chosen.budgets or not (options.refine or options.budget or counted):
         return chosen.run(views, options, progress)
 
     from .fitting.budget import apply_budget
-    from .fitting.refine import refine, start_size
+    from .fitting.fit_views import no_larger
+    from .fitting.refine import Few, refine, start_size
 
     device = fitting_device(options.device)
     # What is merged into a few thousand Gaussians may start from small pictures, in a quarter of the time.
     as_given = chosen.has_depth or chosen.fits or "%" in (options.budget or "")
     start = chosen.run(views if as_given else start_size(views), options, None)
-    told = {"has_depth": chosen.has_depth, "device": device, "progress": progress}
+    told = {"has_depth": chosen.has_depth, "device": device, "seed": options.seed, "progress": progress}
+    told["steps"], most = options.steps, None
+    if quality := options.named_quality:
+        few, views = Few.of(chosen.has_depth), no_larger(views, quality.size)
+        told["steps"] = min(quality.steps, few.max_steps)
+        most = min(quality.gaussians, few.limit(views)) if len(start) > quality.gaussians else None
     if options.budget:
         return apply_budget(start, views, options.budget, options.refine, max_loss=options.max_loss, **told)
-    return refine(start, views, options.refine, **told)
+    return refine(start, views, options.refine, max_gaussians=most, **told)
