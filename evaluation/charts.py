@@ -110,7 +110,7 @@ def lines(means: list[Mean]) -> dict[str, list[Mean]]:
     for m in means:
         found.setdefault(kind(m), []).append(m)
     out = {}
-    for (name, _, what, by), group in found.items():
+    for (_, _, what, by), group in found.items():
         head = re.split(r"[:+]", group[0].method.label)[0]  # with other weights, where it has them
         if what == "budget":
             whole = f"{head}{by}"
@@ -121,7 +121,7 @@ def lines(means: list[Mean]) -> dict[str, list[Mean]]:
         elif by:
             out[f"{head}+{by}"] = sorted(group, key=lambda m: m.method.counted)
         else:
-            refined = len(group) > 1 and name not in ("4dgs", "som")
+            refined = len(group) > 1 and any(m.method.refine for m in group)
             out[f"{head}+refine" if refined else head] = sorted(group, key=lambda m: m.method.fit_seconds)
     return out
 

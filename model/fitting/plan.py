@@ -8,11 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 PROBE_SHARE = 0.05  # of the seconds that steps may take by which the speed is measured
-CORRECTED = (0.1, 0.25, 0.5)  # of the seconds: the plan is corrected there, as scenes grow and shrink under a fit
+# Shares of the seconds after which the plan is corrected, and by what factor at the most: early, as the measure may
+# have been wrong; then a little, as scenes grow and shrink under a fit. A stall, or a machine that becomes busy later,
+# must not cut the rest off.
+CORRECTED = ((0.1, 2.0), (0.25, 2.0), (0.5, 1.25), (0.75, 1.25))
 LATE = 1.5  # times the seconds, from which on what is left of the schedule is cut short
 LAST = 1.6  # times the seconds, by which it then ends
 LEAST_CHANGE = 0.02  # of what is left, for which a plan is corrected
-MOST_CHANGE = 2.0  # by which a correction multiplies or divides what is left: a stall must not cut the rest off
 
 
 @dataclass(frozen=True)
@@ -84,13 +86,14 @@ class TimedPlan(Plan):
         if done >= self.steps:
             return ""
         said, fraction = "", self.fraction(done)
-        if self.corrections and elapsed >= self.corrections[0] * self.seconds and self.expected > 0:
-            self.corrections = [c for c in self.corrections if elapsed < c * self.seconds]
+        if self.corrections and elapsed >= self.corrections[0][0] * self.seconds and self.expected > 0:
+            _, most = self.corrections[0]
+            self.corrections = [c for c in self.corrections if elapsed < c[0] * self.seconds]
             self.costs = self.costs.times((elapsed - self.since) / self.expected)
             self.since, self.expected = elapsed, 0.0
             left, fitting = self.steps - done, self._fitting(elapsed, done)
             if abs(fitting - left) > LEAST_CHANGE * left:
-                self._leave(min(max(fitting, left / MOST_CHANGE), left * MOST_CHANGE), done)
+                self._leave(min(max(fitting, left / most), left * most), done)
         elif elapsed > LATE * self.seconds:
             took = max(elapsed - self.before, 1e-9)  # as the machine is now
             left = max(int((LAST * self.seconds - elapsed) / took), 1)
