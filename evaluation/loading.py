@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ..datagen.sequence import InputError, Sequence, read_sequence
-from ..model.training.dataset import shrink
-from ..model.views import Views, load_views
+from ..model.views import Views, load_views, shrink
 from .flip import features
 
 

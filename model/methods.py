@@ -68,7 +68,8 @@ class Method:
 
     name: str
     about: str  # what it is and whose
-    # (views, options, progress): options.checkpoint is what to load, progress is called by what takes seconds
+    # (views, options, progress): views of the quality's size, options.checkpoint is what to load, progress is called by
+    # what takes seconds
     run: Callable[[Views, ReconstructOptions, Progress | None], Gaussians4D | ReconstructedScene]
     has_depth: bool = False  # sees depth and motion vectors; else RGB and alpha alone
     fits: bool = False  # to the scene, for some seconds or steps

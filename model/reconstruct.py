@@ -12,7 +12,7 @@ from .checkpoints_io import CHECKPOINTS
 from .devices import fitting_device
 from .gaussians import Gaussians4D, ReconstructedScene
 from .methods import Progress, ReconstructOptions, method_named
-from .views import Views, load_views
+from .views import Views, load_views, shrink
 
 DEFAULTS = ReconstructOptions()
 
@@ -73,12 +73,14 @@ def reconstruct_views(
     chosen = method_named(method)
     if chosen.checkpoint and not options.checkpoint:
         options = replace(options, checkpoint=CHECKPOINTS / f"{chosen.checkpoint}.safetensors")
+    quality = options.named_quality
+    if quality:
+        views = shrink(views, -(-max(views.size) // quality.size))
     counted = options.counted and not chosen.fits  # those that fit a scene have taken these steps by then
     if chosen.budgets or not (options.refine or options.budget or counted):
         return chosen.run(views, options, progress)
 
     from .fitting.budget import apply_budget
-    from .fitting.fit_views import no_larger
     from .fitting.refine import Few, refine, start_size
 
     device = fitting_device(options.device)
@@ -87,8 +89,8 @@ def reconstruct_views(
     start = chosen.run(views if as_given else start_size(views), options, None)
     told = {"has_depth": chosen.has_depth, "device": device, "seed": options.seed, "progress": progress}
     told["steps"], most = options.steps, None
-    if quality := options.named_quality:
-        few, views = Few.of(chosen.has_depth), no_larger(views, quality.size)
+    if quality:
+        few = Few.of(chosen.has_depth)
         told["steps"] = min(quality.steps, few.max_steps)
         most = min(quality.gaussians, few.limit(views)) if len(start) > quality.gaussians else None
     if options.budget:

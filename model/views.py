@@ -95,6 +95,32 @@ def pad_to_multiple(views: Views, multiple: int) -> Views:
     )
 
 
+def shrink(views: Views, by: int) -> Views:
+    """The views at 1/by of their size: colours and alpha are averaged as light is, depth and motion, if known, over
+    the surface nearest to the camera in each block."""
+    if by == 1:
+        return views
+    height, width = (n // by for n in views.size)
+
+    def blocks(x: Tensor) -> Tensor:  # (V,H,W,C) -> (V,h,w,by²,C)
+        x = x[:, : height * by, : width * by].reshape(len(views), height, by, width, by, -1)
+        return x.transpose(2, 3).flatten(3, 4)
+
+    alpha = blocks(views.alpha[..., None])
+    total = alpha.mean(3)
+    rgb = (blocks(views.rgb) * alpha).mean(3) / total.clamp_min(1e-6)
+    small = replace(views, rgb=rgb, alpha=total[..., 0], intrinsics=views.intrinsics / by, depth=None, flow=None)
+    if views.depth is None or views.flow is None:
+        return small
+    depth, flow = blocks(views.depth[..., None]), blocks(views.flow)
+    near = depth <= depth.amin(3, keepdim=True) + 0.05
+    near &= torch.isfinite(depth)
+    count = near.sum(3)
+    mean = (torch.where(near, depth, 0.0).sum(3) / count.clamp_min(1))[..., 0]
+    flow = torch.where(near, flow, 0.0).sum(3) / count.clamp_min(1) / by
+    return replace(small, depth=torch.where(count[..., 0] > 0, mean, torch.inf), flow=flow)
+
+
 def camera_rays(intrinsics: Tensor, height: int, width: int) -> Tensor:
     """intrinsics (V,4) -> (V,H,W,3) camera-space points at planar z = 1 below each pixel's centre."""
     fx, fy, cx, cy = intrinsics[:, :, None, None].unbind(1)

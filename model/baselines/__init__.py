@@ -12,7 +12,6 @@ from collections.abc import Callable
 from functools import partial
 
 from ..devices import fitting_device
-from ..fitting.fit_views import no_larger
 from ..methods import Method, Progress, ReconstructOptions, load_predictor, register
 from ..views import Views
 from . import four_dgs, gs_lrm, shape_of_motion, visual_hull
@@ -28,9 +27,9 @@ def _static(reconstruct: Callable, views: Views, options: ReconstructOptions, pr
 
 
 def _fitted(fit: Callable, views: Views, options: ReconstructOptions, progress: Progress | None):
-    how = {"steps": options.steps, "seed": options.seed, "progress": progress}
+    how: dict = {"steps": options.steps, "seed": options.seed, "progress": progress}
     if quality := options.named_quality:
-        views, how["steps"], how["max_gaussians"] = no_larger(views, quality.size), quality.steps, quality.gaussians
+        how |= {"steps": quality.steps, "max_gaussians": quality.gaussians}
     return fit(views, fitting_device(options.device), options.seconds, **how)
 
 

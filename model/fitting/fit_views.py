@@ -55,12 +55,6 @@ def reduction(views: Views, side: int) -> int:
     return -(-max(views.size) // side)
 
 
-def no_larger(views: Views, side: int) -> Views:
-    """The views, without depth, flow and surface, averaged down by a whole factor until no side is longer than `side`
-    pixels."""
-    return downsampled(replace(views, depth=None, flow=None, surface=None), reduction(views, side))
-
-
 def validation_views(views: Views, count: int = VALIDATION_VIEWS) -> Tensor:
     """(at most `count`,) indices of views spread over the clip."""
     order, n = views.time.argsort(stable=True), min(count, len(views))

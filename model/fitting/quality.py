@@ -13,7 +13,7 @@ from ...datagen.sequence import InputError
 class Quality:
     """What a fit is given; a method that gains nothing from so much of it takes less."""
 
-    size: int  # longest side in pixels of the pictures that are fitted; larger ones are averaged down by a whole factor
+    size: int  # longest side in pixels of the pictures; larger ones are averaged down first, by a whole factor
     steps: int
     gaussians: int  # at the most
 

@@ -15,7 +15,7 @@ Held out, they said "stay" of an object that gained 3.5 dB elsewhere, even after
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from ..gaussians import Gaussians4D, ReconstructedScene
 from ..parallel import work_clock
 from ..views import Views
 from .densify import Densifier
-from .fit_views import detached, no_larger, squared_error, validation_views, views_around
+from .fit_views import detached, downsampled, reduction, squared_error, validation_views, views_around
 from .loop import Schedule, Step, gradients, optimise, photometric_loss, warm_up
 from .merge import merge_gaussians
 from .parameters import RATES, Parameters, activate, raw_parameters
@@ -140,7 +140,8 @@ def enlargement(views: Views) -> float:
 def start_size(views: Views) -> Views:
     """The views, without depth and flow, at a size of at most SMALL pixels if refinement would fit them at all: after
     4 seconds, what a prediction from RGB was made of at 64² or 128² was the same to 0.1 dB, on four objects."""
-    return no_larger(views, SMALL if len(views) >= FROM_RGB.min_views else max(views.size))
+    small = replace(views, depth=None, flow=None)
+    return downsampled(small, reduction(views, SMALL)) if len(views) >= FROM_RGB.min_views else small
 
 
 def part(progress, first: float, last: float):

@@ -20,7 +20,7 @@ from ..tracks import Tracks4D
 from ..views import Views
 from .budget import FIRST_TRY, HELD_OUT, parse_budget
 from .fit_tracks import FIT, fit_tracks
-from .fit_views import no_larger, squared_error, validation_views
+from .fit_views import squared_error, validation_views
 from .loop import Schedule, warm_up
 from .quality import Quality
 from .refine import part
@@ -40,14 +40,13 @@ def reconstruct_tracks(
     progress=None,
 ) -> Tracks4D:
     """Views with depth, motion vectors and, where the renderer wrote them, tracks of the surface -> tracks, after at
-    most `seconds` of fitting, or exactly `steps`, or what `quality` says, but no more steps than these views are worth;
-    as they start for 0. budget: see `parse_budget`; a share is of the points that the pixels need. max_loss: dB that
-    `auto` may lose. Raises InputError where nothing can be followed."""
+    most `seconds` of fitting, or exactly `steps`, or the steps of `quality`, but no more than these views are worth,
+    and no more tracks than it says; as they start for 0. budget: see `parse_budget`; a share is of the points that the
+    pixels need. max_loss: dB that `auto` may lose. Raises InputError where nothing can be followed."""
     surface, search = followed(views), 0.0
-    fitted_views = no_larger(views, quality.size) if quality else views
     count = None
     if budget:
-        wanted, needed = parse_budget(budget), needed_points(surface, fitted_views)
+        wanted, needed = parse_budget(budget), needed_points(surface, views)
         if wanted is None:
             search = 0.5
             count = fewest(surface, views, max_loss, progress=part(progress, 0, search))
@@ -57,14 +56,14 @@ def reconstruct_tracks(
     limit = count
     if quality:
         steps, limit = min(quality.steps, most), min(count or quality.gaussians, quality.gaussians)
-        count = min(limit, needed_points(surface, fitted_views))
+        count = min(limit, needed_points(surface, views))
     start = surface_tracks(surface, views, count)
     if not (seconds or steps) or not len(start):
         return start
     schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None, seed=seed)
     told = part(progress, search, 1)
     warm_up("cpu")
-    fitted = fit_tracks(start, fitted_views, schedule, pixel=pixel_size(fitted_views), progress=told)
+    fitted = fit_tracks(start, views, schedule, pixel=pixel_size(views), progress=told)
     return fitted if not limit or len(fitted) <= limit else fitted[fitted.opacity.topk(limit).indices]
 
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cameras to rays, checked by projecting back, and padding that changes nothing that is seen."""
+"""Cameras to rays, checked by projecting back, padding that changes nothing that is seen, and smaller pictures."""
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -7,7 +9,7 @@ import torch
 from timesplat.datagen.sequence import read_sequence
 from timesplat.model.geometry.lift import lift
 from timesplat.model.reconstruct import reconstruct_views
-from timesplat.model.views import load_views, pad_to_multiple, pluecker, rays
+from timesplat.model.views import load_views, pad_to_multiple, pluecker, rays, shrink
 
 
 def test_rays_project_back_to_their_pixels(spheres):
@@ -51,3 +53,18 @@ def test_padding_changes_nothing_that_is_seen(spheres):
     assert padded.size == (32, 32) and pad_to_multiple(padded, 8) is padded
     torch.testing.assert_close(lift(views).xyz, lift(padded).xyz, atol=1e-6, rtol=0)
     assert len(reconstruct_views(views, "guided")) == len(lift(views))
+
+
+def test_shrinking_averages_light_and_keeps_the_nearest_surface(spheres):
+    views = spheres([0, 5], size=32)
+    half = shrink(views, 2)
+    assert half.size == (16, 16)
+    blocks = views.over(0.0).reshape(2, 16, 2, 16, 2, 3).mean((2, 4))
+    torch.testing.assert_close(half.over(0.0), blocks, atol=1e-6, rtol=0)
+    exact = spheres([0, 5], size=16)
+    both = torch.isfinite(exact.depth) & torch.isfinite(half.depth)
+    assert (half.depth - exact.depth)[both].abs().median() < 0.02
+    assert (half.flow - exact.flow)[both].abs().median() < 0.02
+    torch.testing.assert_close(half.intrinsics, exact.intrinsics)
+    blind = shrink(replace(views, depth=None, flow=None), 2)
+    assert blind.depth is None and torch.equal(blind.rgb, half.rgb)

@@ -1,13 +1,11 @@
 """Training data: what comes back is what was rendered, and samples are what they are said to be."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from timesplat.datagen.sequence import InputError, read_sequence
-from timesplat.model.training.dataset import ClipDataset, measure_motion, shrink
+from timesplat.model.training.dataset import ClipDataset, measure_motion
 from timesplat.model.views import load_views
 
 
@@ -53,21 +51,6 @@ def test_static_samples_are_at_time_zero(sphere_folder, tmp_path):
     for part in (sample.inputs, sample.targets):
         assert len(part) == 2 and not part.time.any()
     assert not sample.inputs.flow.any()
-
-
-def test_shrinking_averages_light_and_keeps_the_nearest_surface(spheres):
-    views = spheres([0, 5], size=32)
-    half = shrink(views, 2)
-    assert half.size == (16, 16)
-    blocks = views.over(0.0).reshape(2, 16, 2, 16, 2, 3).mean((2, 4))
-    torch.testing.assert_close(half.over(0.0), blocks, atol=1e-6, rtol=0)
-    exact = spheres([0, 5], size=16)
-    both = torch.isfinite(exact.depth) & torch.isfinite(half.depth)
-    assert (half.depth - exact.depth)[both].abs().median() < 0.02
-    assert (half.flow - exact.flow)[both].abs().median() < 0.02
-    torch.testing.assert_close(half.intrinsics, exact.intrinsics)
-    blind = shrink(replace(views, depth=None, flow=None), 2)
-    assert blind.depth is None and torch.equal(blind.rgb, half.rgb)
 
 
 def clip(distance: float) -> dict:
