@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Qualities: each is more than the one before, and what methods of every kind make of one."""
 
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import pytest
 import torch
@@ -10,9 +10,12 @@ from tests.model import track_scenes as scenes
 from timesplat.datagen.sequence import InputError
 from timesplat.model import baselines  # noqa: F401, adds its methods
 from timesplat.model.fitting import loop
+from timesplat.model.fitting.fit_views import squared_error
 from timesplat.model.fitting.quality import QUALITIES, Quality, quality_named
+from timesplat.model.geometry.surface_tracks import pixel_size
 from timesplat.model.methods import ReconstructOptions
 from timesplat.model.reconstruct import reconstruct_views
+from timesplat.model.views import shrink
 
 
 def test_each_is_more_than_the_one_before():
@@ -55,6 +58,21 @@ def test_what_does_not_fit_is_refined(spheres, drawn, no_clock, method):
     assert len(drawn) == 20 and set(drawn) == {24} and 20 < len(g) <= 150
     kept = reconstruct_views(views, method, ReconstructOptions(steps=9))
     assert len(drawn) == 29 and drawn[20:] == [48] * 9 and len(kept) > 150
+
+
+@pytest.mark.parametrize("method", ["tracks", "4dgs"])
+def test_what_small_pictures_fitted_is_as_wide_in_large_ones(drawn, method):
+    """Drawn in the pictures as they were given it is as good as in those that were fitted, but for what these lack."""
+    views, others = scenes.views(), scenes.views(9, seed=5)
+    QUALITIES["tiny"] = Quality(16, 200, 600)
+    small = replace(shrink(others, 3), depth=None)
+    wide = reconstruct_views(views, method, ReconstructOptions(quality="tiny"))
+    plain = reconstruct_views(shrink(views, 3), method, ReconstructOptions(quality="tiny"))
+    blur = 0.3 * 8 * pixel_size(views) ** 2
+    torch.testing.assert_close(wide.scale.square(), plain.scale.square() + blur)
+    with torch.inference_mode():
+        assert squared_error(wide, others) < 0.8 * squared_error(plain, others)
+        assert squared_error(plain, small) < squared_error(plain, others)
 
 
 def test_budgets_hold_within_a_quality(spheres, drawn, no_clock):
