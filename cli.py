@@ -8,6 +8,8 @@ import io
 import os
 import shlex
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -100,15 +102,24 @@ def train(args: argparse.Namespace) -> int:
 
 
 def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
+    from .model.fitting.quality import QUALITIES
+
+    meanings = "; ".join(f"{n}: {q.size} pixels, {q.steps:,} steps, {q.gaussians:,}" for n, q in QUALITIES.items())
     p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote, or one in the format "
                    "of D-NeRF")  # fmt: skip
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
     p.add_argument("--method", help="tracks, lift, guided, rgb, sweep, predicted, 4dgs (default: tracks "
                    "where the renderer wrote surface tracks, else guided where it wrote depth, else rgb)")  # fmt: skip
-    p.add_argument(
-        "--seconds", type=float, default=10.0, help="for methods that fit the scene: tracks, 4dgs (default: 10)"
-    )
+    p.add_argument("--quality", help="how much is fitted, and the same comes out however busy the machine is: the "
+                   "longest side of the pictures, steps, most Gaussians. The pictures are averaged down by a whole "
+                   "factor; a method that gains nothing from so many steps or Gaussians takes fewer; one that does not "
+                   f"fit is refined. {meanings}. (default: none, --seconds and --refine hold)")  # fmt: skip
+    p.add_argument("--steps", type=int, help="exactly so many steps of the method's own fit, or of refinement where it "
+                   "has none; in place of --quality")  # fmt: skip
+    p.add_argument("--seconds", type=float, help="for methods that fit the scene: tracks, 4dgs; as many steps are "
+                   "planned as fit (default: 10)")  # fmt: skip
     p.add_argument("--refine", type=float, default=0.0, help="seconds of fitting the result to the views (default: 0)")
+    p.add_argument("--seed", type=int, default=0, help="of all that is random in fits (default: 0)")
     p.add_argument("--budget", help="most Gaussians: a number, a share of those predicted such as 10%%, or auto: as "
                    "many as the scene needs; fits them for --refine seconds, or 5")  # fmt: skip
     p.add_argument("--max-loss", type=float, default=0.1, help="dB that --budget auto may lose (default: 0.1)")
@@ -130,16 +141,22 @@ def reconstruct(args: argparse.Namespace) -> int:
     from .model.geometry.coverage import coverage
     from .model.io.ply import write_ply
     from .model.methods import ReconstructOptions, method_named
-    from .model.reconstruct import chosen_method, untracked_note
+    from .model.reconstruct import DEFAULTS, chosen_method, untracked_note
     from .model.reconstruct import reconstruct as run
     from .model.views import load_views
 
     start = time.perf_counter()
+    if args.seconds is not None and (args.quality or args.steps is not None):
+        other = "--quality" if args.quality else "--steps"
+        raise InputError(f"--seconds and {other}: each says how long a fit goes on; give one of them.")
     options = ReconstructOptions(
         device=args.device,
         checkpoint=args.checkpoint,
-        seconds=args.seconds,
+        seconds=DEFAULTS.seconds if args.seconds is None else args.seconds,
         refine=args.refine,
+        quality=args.quality,
+        steps=args.steps,
+        seed=args.seed,
         budget=args.budget,
         max_loss=args.max_loss,
     )
@@ -149,16 +166,34 @@ def reconstruct(args: argparse.Namespace) -> int:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else all_inputs(seq)
     method = method_named(chosen_method(seq, args.method, indices))
-    g = run(seq, method.name, indices, options, size=args.size)
+    with _bar() as progress:
+        g = run(seq, method.name, indices, options, progress, size=args.size)
     write_ply(args.out, g.to_asset(clip_of(seq)))
     taken = time.perf_counter() - start
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")
     if method.has_depth and (note := untracked_note(seq)):
         print(note)
-    if method.knows_surface and not (args.refine or args.budget):
+    if method.knows_surface and not (args.refine or args.budget or options.counted):
         share, _ = coverage(g, load_views(seq, indices, method.has_depth, args.size))
         print(f"coverage {share:.0%}" + ("" if share > 0.99 else ": what no camera saw is left open"))
     return 0
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[float, str], None]]:
+    """A callback that shows on a terminal, after two seconds, how far something is; what is said of plans it prints."""
+    from tqdm import tqdm
+
+    with tqdm(total=100, unit="%", delay=2, leave=False, disable=None) as bar:
+
+        def progress(fraction: float, text: str) -> None:
+            if "planned" in text:
+                bar.write(text)
+            else:
+                bar.set_description_str(text, refresh=False)
+            bar.update(int(100 * fraction) - bar.n)
+
+        yield progress
 
 
 # ---------------------------------------------------------------- export, extension

@@ -15,6 +15,17 @@ FIT_SECONDS = 5.0  # of a budget's own fit, of pictures of USUAL_PIXELS
 USUAL_PIXELS = 128**2  # of a picture
 USUAL_GAUSSIANS = 4000  # that a fit of pictures of USUAL_PIXELS uses at most, and in proportion to their sides
 SECONDS_A_PIXEL = {"tracks": 1e-6, "guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
+# Seconds of a step, one thread: for each pixel of a picture, and for each Gaussian.
+STEP_A_PIXEL, STEP_A_GAUSSIAN = 3e-7, 1e-6
+# As the worker has them (a test compares): longest side in pixels, steps and most Gaussians of a quality …
+QUALITIES = {
+    "DRAFT": (128, 300, 10_000),
+    "BALANCED": (256, 1500, 30_000),
+    "FINE": (512, 4000, 100_000),
+    "BEST": (1024, 15_000, 200_000),
+}
+MOST_STEPS = {"guided": 3000, "lift": 3000, "rgb": 1500}  # … and the steps beyond which a method gains nothing
+TRACK_STEPS = (600, 25)  # of tracks: so many, or so many a picture if that is more
 _seconds_a_sample = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
 
 
@@ -41,14 +52,27 @@ def estimate(settings, context) -> Estimate:
     else:
         if settings.budget != "ALL":
             fit = fit or FIT_SECONDS * max(settings.size**2 / USUAL_PIXELS, 1)
-        if fit:
+        if fit or settings.quality != "SECONDS":
             most = USUAL_GAUSSIANS * settings.size / USUAL_PIXELS**0.5
+    if settings.quality != "SECONDS":
+        most = min(most, QUALITIES[settings.quality][2])
     kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
     count = min(kept, most, predicted)
+    if settings.quality != "SECONDS":
+        fit = _fit_seconds(settings, n, count)
     fits = 3 if settings.budget == "AUTO" else 1
     rendering = START_SECONDS + pixels * settings.samples * _seconds_a_sample
     reconstructing = START_SECONDS + pixels * SECONDS_A_PIXEL[settings.method] + fit * fits
     return Estimate(n, rendering, reconstructing, round(count))
+
+
+def _fit_seconds(settings, pictures: int, gaussians: float) -> float:
+    """Of the steps of a quality with so many Gaussians."""
+    size, steps, _ = QUALITIES[settings.quality]
+    least, each = TRACK_STEPS
+    most = max(least, each * pictures) if settings.method == "tracks" else MOST_STEPS[settings.method]
+    size = settings.size / -(-settings.size // size)  # averaged down by a whole factor
+    return min(steps, most) * (size**2 * STEP_A_PIXEL + gaussians * STEP_A_GAUSSIAN)
 
 
 def learn_speed(seconds: float, pixels: int, samples: int) -> None:

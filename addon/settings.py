@@ -23,6 +23,13 @@ METHODS = [
     ("lift", "Lift", "Depth and motion straight to Gaussians, without a network: fastest"),
     ("rgb", "Pictures Only", "The network from colour alone, as it would be for photographs"),
 ]
+QUALITIES = [  # what they mean is the worker's (model/fitting/quality.py): steps, not seconds
+    ("DRAFT", "Draft", "A few steps, at most 10,000 Gaussians: for pictures of 128 pixels"),
+    ("BALANCED", "Balanced", "At most 30,000 Gaussians, for pictures of 256 pixels"),
+    ("FINE", "Fine", "At most 100,000 Gaussians, for pictures of 512 pixels"),
+    ("BEST", "Best", "As much as ever gains anything, for pictures of 1024 pixels"),
+    ("SECONDS", "Seconds", "As many steps as fit into so many seconds"),
+]
 BUDGETS = [
     ("ALL", "All", "Every Gaussian that was predicted"),
     ("SHARE", "Share", "A share of those predicted, fitted to the pictures: fewer and better"),
@@ -68,10 +75,17 @@ class Settings:
         default=True,
     )
     method: EnumProperty(name="Method", items=METHODS, default=METHODS[0][0])
+    quality: EnumProperty(
+        name="Quality",
+        description="How much is fitted to the pictures. All but Seconds come out the same however busy the machine is",
+        items=QUALITIES,
+        default="SECONDS",
+    )
     refine: FloatProperty(
         name="Refine",
-        description="Seconds for which the Gaussians are fitted to the pictures, at most. 0: none for Tracks and where "
-        "all are kept; for fewer as long as it takes, 5 s for pictures of 128 pixels and more for larger ones",
+        description="With Quality at Seconds: those for which the Gaussians are fitted to the pictures, at most. 0: "
+        "none for Tracks and where all are kept; for fewer as long as it takes, 5 s for pictures of 128 pixels and "
+        "more for larger ones",
         default=10.0,
         min=0.0,
         max=3600.0,
@@ -149,6 +163,13 @@ def budget(settings) -> str | None:
     return {"ALL": None, "SHARE": f"{settings.share:g}%", "NUMBER": str(settings.number), "AUTO": "auto"}[
         settings.budget
     ]
+
+
+def fit(settings) -> dict:
+    """How long is fitted, as the worker has it: a quality, or seconds."""
+    if settings.quality == "SECONDS":
+        return {"quality": None, "refine": settings.refine}
+    return {"quality": settings.quality.lower(), "refine": 0.0}
 
 
 def register() -> None:

@@ -92,10 +92,15 @@ def _save(fig, path: Path, name: str, command: str) -> str:
 
 
 def kind(m: Mean) -> tuple:
-    """What a line joins: fits of one method for several seconds, refinements of one, budgets of one."""
+    """What a line joins: fits of one method for several seconds, steps or qualities, refinements of one, budgets of
+    one."""
     method = m.method
     what = "budget" if method.budget else "dense" if method.dense else ""
-    return method.method, method.checkpoint, what, method.refine if method.budget else None
+    by = next((k for k in ("refine", "quality", "steps") if getattr(method, k)), "")
+    value = getattr(method, by) if by else None
+    if method.budget:  # of this
+        return method.method, method.checkpoint, what, f"+{by}:{value:g}" if by == "refine" else by and f"+{by}:{value}"
+    return method.method, method.checkpoint, what, "" if by == "refine" else by
 
 
 def lines(means: list[Mean]) -> dict[str, list[Mean]]:
@@ -105,16 +110,18 @@ def lines(means: list[Mean]) -> dict[str, list[Mean]]:
     for m in means:
         found.setdefault(kind(m), []).append(m)
     out = {}
-    for (name, _, what, refine), group in found.items():
+    for (_, _, what, by), group in found.items():
         head = re.split(r"[:+]", group[0].method.label)[0]  # with other weights, where it has them
         if what == "budget":
-            whole = f"{head}+refine:{refine:g}" if refine else head
+            whole = f"{head}{by}"
             group = [m for m in means if m.method.label == whole] + group
             out[f"{whole}+budget"] = sorted(group, key=lambda m: m["gaussians"])
         elif what == "dense":
             out |= {m.method.label: [m] for m in group}
+        elif by:
+            out[f"{head}+{by}"] = sorted(group, key=lambda m: m.method.counted)
         else:
-            refined = len(group) > 1 and name not in ("4dgs", "som")
+            refined = len(group) > 1 and any(m.method.refine for m in group)
             out[f"{head}+refine" if refined else head] = sorted(group, key=lambda m: m.method.fit_seconds)
     return out
 
@@ -166,6 +173,8 @@ def trade(ax, means: list[Mean], cost: str, worth: str) -> tuple:
 
 def hint(m: Mean) -> str:
     """What tells a point from the others of its line, where the x axis does not."""
+    if m.method.counted and not m.method.budget:
+        return m.method.quality or f"{m.method.counted} steps"
     return m.method.budget or (f"{m.method.fit_seconds:g} s" if m.method.fit_seconds else "")
 
 

@@ -63,7 +63,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
                    "(default: %(default)s)")  # fmt: skip
     p.add_argument("--samples", type=int, default=d.samples, help="Cycles samples (default: %(default)s)")
     p.add_argument("--methods", default=d.methods, help="comma-separated METHOD[@CHECKPOINT][:SECONDS]"
-                   "[+refine:SECONDS][+budget:N|P%%|auto][+dense], LABEL=… before (default: %(default)s)")  # fmt: skip
+                   "[+refine:SECONDS][+quality:NAME][+steps:N][+budget:N|P%%|auto][+dense], LABEL=… before "
+                   "(default: %(default)s)")  # fmt: skip
     p.add_argument("--checkpoint", type=Path, help="weights for the one network method named")
     p.add_argument("--out", type=Path, required=True, help="folder for renders, metrics.json, tables.md, tables.csv")
     p.add_argument("--jobs", type=int, default=d.jobs, help="processes, one core each (default: %(default)s)")

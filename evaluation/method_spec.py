@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """One way to go from posed images to a scene, as it is written on command lines and in tables:
 
-[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+budget:N|P%|auto][+dense]
+[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+quality:NAME][+steps:N][+budget:N|P%|auto][+dense]
 
 guided                                      a method of `timesplat reconstruct`
 4dgs:10                                     one that fits the scene, for ten seconds
+tracks+quality:fine                         fitted as much as that means, however long it takes
+4dgs+steps:2000                             fitted, or where the method does not fit refined, by so many steps
 rgb+refine:4+budget:10%                     refined for four seconds, with a tenth of the Gaussians
 mine=predicted@runs/mine/network.safetensors    other weights, under a name of its own
 guided@small                                the shipped checkpoint guided-small
@@ -21,15 +23,19 @@ from ..model import baselines  # noqa: F401 (they register themselves)
 from ..model.checkpoints_io import CHECKPOINTS
 from ..model.fitting.budget import SECONDS as BUDGET_SECONDS
 from ..model.fitting.budget import parse_budget
-from ..model.methods import METHODS, method_named
+from ..model.fitting.quality import QUALITIES
+from ..model.methods import METHODS, ReconstructOptions, method_named
 from .provenance import file_hash
 
-FORM = "[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+budget:N|P%|auto][+dense]"
+FORM = "[LABEL=]METHOD[@CHECKPOINT][:SECONDS][+refine:SECONDS][+quality:NAME][+steps:N][+budget:N|P%|auto][+dense]"
+STEP_SECONDS = 0.01  # that a step may take, roughly: for the order of runs, and what a quick one leaves out
 _NUMBER = r"\d+(?:\.\d+)?"
 _SPEC = re.compile(
     rf"(?:(?P<label>[^=+@:]+)=)?(?P<method>[^=+@:]+)(?:@(?P<weights>[^+]+?))?(?::(?P<seconds>{_NUMBER}))?(?P<options>\+.*)?"
 )
-_OPTION = re.compile(rf"(?:(refine):({_NUMBER})|(budget):({_NUMBER}%?|auto)|(dense))")
+_OPTION = re.compile(
+    rf"(?:(refine):({_NUMBER})|(budget):({_NUMBER}%?|auto)|(quality):({'|'.join(QUALITIES)})|(steps):(\d+)|(dense))"
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,8 @@ class MethodSpec:
     refine: float | None = None  # seconds of test-time optimisation
     budget: str | None = None  # most Gaussians, a share of those predicted, or auto
     dense: bool = False  # a network's tokens everywhere, not only where the object is
+    quality: str | None = None  # a name of QUALITIES, in place of seconds
+    steps: int | None = None  # of fitting, or of refinement where the method does not fit; likewise
 
     @property
     def has_depth(self) -> bool:
@@ -55,8 +63,21 @@ class MethodSpec:
         return METHODS[self.method].baseline
 
     @property
+    def counted(self) -> int:
+        """Steps of fitting, where it goes by them; else 0."""
+        return self.steps or (QUALITIES[self.quality].steps if self.quality else 0)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether what the method makes is refined, or kept within a budget."""
+        return bool(self.refine or self.budget or self.counted)
+
+    @property
     def fit_seconds(self) -> float:
-        """Seconds of fitting in all, without what the budget `auto` takes to find its number."""
+        """Seconds of fitting in all, without what the budget `auto` takes to find its number; roughly, where it goes by
+        steps."""
+        if self.counted:
+            return STEP_SECONDS * self.counted
         return (self.seconds or 0.0) + (self.refine or (BUDGET_SECONDS if self.budget else 0.0))
 
     @property
@@ -69,7 +90,8 @@ class MethodSpec:
     def fingerprint(self) -> str:
         """Changes with all that has a say in the result but the code: the options, and the bytes of the weights."""
         options = (self.method, self.seconds, self.refine, self.budget, self.dense)
-        return " ".join(map(str, (*options, file_hash(self.weights) if self.weights else "-")))
+        counted = (self.quality, self.steps) if self.counted else ()  # rows of before know no such options
+        return " ".join(map(str, (*options, file_hash(self.weights) if self.weights else "-", *counted)))
 
 
 def parse_spec(text: str, seconds: float | None = None, checkpoint: Path | None = None) -> MethodSpec:
@@ -92,7 +114,11 @@ def parse_spec(text: str, seconds: float | None = None, checkpoint: Path | None 
         found[name] = value
     if found.get("budget"):
         parse_budget(found["budget"])
-    if not fits:
+    steps, counted = int(found["steps"]) if "steps" in found else None, [k for k in ("quality", "steps") if k in found]
+    if own and counted:
+        raise InputError(f"{text}: seconds and {counted[0]}: each says how long a fit goes on; give one of them.")
+    ReconstructOptions(refine=float(found.get("refine", 0)), quality=found.get("quality"), steps=steps)  # refuses both
+    if not fits or counted:
         seconds = None
     elif own:
         seconds = float(own)
@@ -105,6 +131,8 @@ def parse_spec(text: str, seconds: float | None = None, checkpoint: Path | None 
         refine=float(found["refine"]) if "refine" in found else None,
         budget=found.get("budget"),
         dense="dense" in found,
+        quality=found.get("quality"),
+        steps=steps,
     )
 
 

@@ -165,11 +165,13 @@ def score_run(run: Run, conditions: Conditions, cache: Cache, key: str, load_dep
 def warm_up(run: Run, methods: list[MethodSpec], device: str = "cpu") -> None:
     """Every kind of method once on two views of a run, so that no timing holds the compilation of kernels (about
     fifteen seconds, the first time on a machine) or imports."""
-    kinds = {(m.method, m.checkpoint, bool(m.refine), bool(m.budget)): m for m in methods}
+    kinds = {(m.method, m.checkpoint, bool(m.refine), bool(m.counted), bool(m.budget)): m for m in methods}
     seq = open_sequence(run.folder)
     for method in kinds.values():
         views = load_views(seq, run.inputs[:2], method.has_depth, run.size)
         brief = replace(method, refine=method.refine and WARM_UP_SECONDS, seconds=WARM_UP_SECONDS)
+        if method.counted:
+            brief = replace(brief, quality=None, steps=1)
         draw(reconstruct(views, brief, device), views[:1])
 
 

@@ -40,6 +40,8 @@ def reconstruct(
                 checkpoint=method.checkpoint,
                 seconds=method.seconds or seconds,
                 refine=method.refine or 0.0,
+                quality=method.quality,
+                steps=method.steps,
                 budget=method.budget,
                 dense=method.dense,
             ),
@@ -89,7 +91,7 @@ def costs(
     start = work_clock()
     draw(scene, truth.views)
     drawing = 1000 * (work_clock() - start) / len(truth.picture)
-    known = METHODS[method.method].knows_surface and not (method.refine or method.budget or method.dense)
+    known = METHODS[method.method].knows_surface and not (method.fitted or method.dense)
     sizes = megabytes(scene, seq)
     covered = coverage(scene, views)[0] if known and isinstance(scene, Gaussians4D) else None
     return dict(zip(COSTS, (*sizes, drawing, covered), strict=True))

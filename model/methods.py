@@ -12,23 +12,35 @@ from functools import partial
 from pathlib import Path
 
 from ..datagen.sequence import InputError
+from .fitting.quality import Quality, quality_named
 from .gaussians import Gaussians4D, ReconstructedScene
 from .views import Views
 
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """How a scene is reconstructed. Raises InputError for seconds and budgets that are none."""
+    """How a scene is reconstructed. Raises InputError for seconds, steps, qualities and budgets that are none, and for
+    more than one of quality, steps and refine."""
 
     device: str = "cpu"  # of networks, as torch names it; fits take the processor where it has no rasteriser
     checkpoint: Path | None = None  # weights in place of the shipped ones
     seconds: float = 10.0  # that methods which fit a scene may take
     refine: float = 0.0  # seconds for which the result is then fitted to the views
+    quality: str | None = None  # a name of QUALITIES, which says how much is fitted, in place of seconds
+    steps: int | None = None  # exactly so many of the method's own fit, or of refinement where it has none; likewise
     budget: str | None = None  # most Gaussians: "N", "P%" or "auto"
     max_loss: float = 0.1  # dB that "auto" may lose
     dense: bool = False  # a network's tokens everywhere, and not only where the object is
+    seed: int = 0  # of all that is random in fits
 
     def __post_init__(self):
+        asked = {"quality": self.quality, "steps": self.steps is not None, "refine": self.refine}
+        if len(both := [k for k, v in asked.items() if v]) > 1:
+            raise InputError(f"{' and '.join(both)}: each says how long a fit goes on; give one of them.")
+        if self.quality:
+            quality_named(self.quality)
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"{self.steps} steps: give 1 or more.")
         if self.refine or self.budget:  # refuse now what else is found out after seconds
             from .fitting.budget import parse_budget
             from .fitting.refine import check_seconds
@@ -36,6 +48,15 @@ class ReconstructOptions:
             check_seconds(self.refine)
             if self.budget:
                 parse_budget(self.budget)
+
+    @property
+    def named_quality(self) -> Quality | None:
+        return quality_named(self.quality) if self.quality else None
+
+    @property
+    def counted(self) -> bool:
+        """Whether fits go by steps, and so come out the same whatever the machine does beside."""
+        return bool(self.quality) or self.steps is not None
 
 
 Progress = Callable[[float, str], None]  # fraction 0..1, what is done
@@ -47,10 +68,11 @@ class Method:
 
     name: str
     about: str  # what it is and whose
-    # (views, options, progress): options.checkpoint is what to load, progress is called by what takes seconds
+    # (views, options, progress): views of the quality's size, options.checkpoint is what to load, progress is called by
+    # what takes seconds
     run: Callable[[Views, ReconstructOptions, Progress | None], Gaussians4D | ReconstructedScene]
     has_depth: bool = False  # sees depth and motion vectors; else RGB and alpha alone
-    fits: bool = False  # to the scene, for some seconds
+    fits: bool = False  # to the scene, for some seconds or steps
     baseline: bool = False  # what the product is compared with
     budgets: bool = False  # keeps within options.budget itself
     checkpoint: str | None = None  # name of the shipped weights that it loads
@@ -82,8 +104,8 @@ def run_tracks(views: Views, options: ReconstructOptions, progress: Progress | N
     from .fitting.track_views import reconstruct_tracks
 
     seconds = options.refine or options.seconds
-    told = {"budget": options.budget, "max_loss": options.max_loss, "progress": progress}
-    return reconstruct_tracks(views, seconds, **told)
+    told = {"budget": options.budget, "max_loss": options.max_loss, "seed": options.seed, "progress": progress}
+    return reconstruct_tracks(views, seconds, steps=options.steps, quality=options.named_quality, **told)
 
 
 def load_predictor(options: ReconstructOptions) -> Callable[[Views], Gaussians4D]:

@@ -12,7 +12,8 @@ from .checkpoints_io import CHECKPOINTS
 from .devices import fitting_device
 from .gaussians import Gaussians4D, ReconstructedScene
 from .methods import Progress, ReconstructOptions, method_named
-from .views import Views, load_views
+from .tracks import Tracks4D
+from .views import Views, load_views, shrink
 
 DEFAULTS = ReconstructOptions()
 
@@ -71,20 +72,42 @@ def reconstruct_views(
     views: Views, method: str, options: ReconstructOptions = DEFAULTS, progress: Progress | None = None
 ) -> Gaussians4D | ReconstructedScene:
     """The same from tensors; unfiltered. `progress(fraction, text)` is called by what takes seconds."""
+    quality = options.named_quality
+    by = -(-max(views.size) // quality.size) if quality else 1
+    scene = _reconstruct(shrink(views, by), method, options, progress)
+    if by > 1 and isinstance(scene, Gaussians4D | Tracks4D):
+        from .geometry.surface_tracks import pixel_size
+        from .rasterize.constants import BLUR
+
+        # They were fitted as they are drawn in the smaller pictures, blurred by some of the larger pixels.
+        blur = BLUR * (by**2 - 1) * pixel_size(views) ** 2
+        return replace(scene, scale=(scene.scale.square() + blur).sqrt())
+    return scene
+
+
+def _reconstruct(
+    views: Views, method: str, options: ReconstructOptions, progress: Progress | None
+) -> Gaussians4D | ReconstructedScene:
     chosen = method_named(method)
     if chosen.checkpoint and not options.checkpoint:
         options = replace(options, checkpoint=CHECKPOINTS / f"{chosen.checkpoint}.safetensors")
-    if chosen.budgets or not (options.refine or options.budget):
+    counted = options.counted and not chosen.fits  # those that fit a scene have taken these steps by then
+    if chosen.budgets or not (options.refine or options.budget or counted):
         return chosen.run(views, options, progress)
 
     from .fitting.budget import apply_budget
-    from .fitting.refine import refine, start_size
+    from .fitting.refine import Few, refine, start_size
 
     device = fitting_device(options.device)
     # What is merged into a few thousand Gaussians may start from small pictures, in a quarter of the time.
     as_given = chosen.has_depth or chosen.fits or "%" in (options.budget or "")
     start = chosen.run(views if as_given else start_size(views), options, None)
-    told = {"has_depth": chosen.has_depth, "device": device, "progress": progress}
+    told = {"has_depth": chosen.has_depth, "device": device, "seed": options.seed, "progress": progress}
+    told["steps"], most = options.steps, None
+    if quality := options.named_quality:
+        few = Few.of(chosen.has_depth)
+        told["steps"] = min(quality.steps, few.max_steps)
+        most = min(quality.gaussians, few.limit(views)) if len(start) > quality.gaussians else None
     if options.budget:
         return apply_budget(start, views, options.budget, options.refine, max_loss=options.max_loss, **told)
-    return refine(start, views, options.refine, **told)
+    return refine(start, views, options.refine, max_gaussians=most, **told)

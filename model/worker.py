@@ -7,6 +7,7 @@ to do; null or "" is the same as leaving a key out:
         sequence    folder of a Sequence            asset       .ply to write
         method      tracks | lift | guided | …      device      "cpu" (default), "cuda", …
         checkpoint  weights to use                  indices     views to use (default: all)
+        quality     draft | balanced | fine | best, how much is fitted; or in its place
         refine      seconds of fitting (0) …        budget      "N", "P%" or "auto"
         max_loss    dB that "auto" may lose (0.1)   … which for tracks are all that there are
         done: asset, gaussians, method, note (what the artist should know; a sentence or nothing)
@@ -56,7 +57,7 @@ _KEYS = {
     "task": "text", "watch": "true or false", "sequence": "text", "asset": "text", "method": "text",
     "device": "text", "checkpoint": "text", "indices": "list", "refine": "number", "budget": "text",
     "max_loss": "number", "out": "text", "mode": "text", "half": "true or false", "source": "text",
-    "original": "text", "motion": "text",
+    "original": "text", "motion": "text", "quality": "text",
 }  # fmt: skip
 _NEEDED = {"reconstruct": ("sequence", "asset"), "export": ("asset", "out"), "import": ("source", "asset")}
 _NEEDED |= {"selftest": ()}
@@ -108,7 +109,8 @@ def _reconstruct(request: dict, progress) -> dict:
     from .io.ply import write_ply
 
     refine, budget, checkpoint = request.get("refine", 0.0), request.get("budget"), request.get("checkpoint")
-    if not (refine or budget) and request.get("method", "tracks") != "tracks":
+    quality = request.get("quality")
+    if not (refine or budget or quality) and request.get("method", "tracks") != "tracks":
         # A third of torch's start-up: what shapes its operations return, for compilers. What fits uses
         # torch.optim, which loads them; so do tracks' random numbers.
         sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
@@ -122,6 +124,7 @@ def _reconstruct(request: dict, progress) -> dict:
         checkpoint=Path(checkpoint) if checkpoint else None,
         seconds=refine,
         refine=refine,
+        quality=quality,
         budget=budget,
         max_loss=max_loss,
     )

@@ -108,6 +108,12 @@ def test_methods_and_checkpoints(sphere_folder, tmp_path, capsys):
         capsys, "reconstruct", sphere_folder, "--out", out, "--checkpoint", bad, says="not a whole", names="bad.safe"
     )
     refused(capsys, "reconstruct", sphere_folder, "--out", out, "--device", "abacus", says="cannot use this device")
+    once = ("reconstruct", sphere_folder, "--out", out, "--quality", "draft")
+    refused(capsys, *once, "--steps", "3", says="quality and steps: each says how long a fit goes on; give one of them")
+    refused(capsys, *once, "--refine", "3", says="quality and refine: each says")
+    refused(capsys, *once, "--seconds", "3", says="--seconds and --quality: each says")
+    refused(capsys, *once[:4], "--steps", "3", "--seconds", "3", says="--seconds and --steps: each says")
+    refused(capsys, *once[:4], "--quality", "superb", says="superb: no such quality; choose one of draft")
     refused(capsys, "train", sphere_folder, "--out", tmp_path / "run", "--device", "abacus", says="this device")
     refused(capsys, "train", sphere_folder, "--out", tmp_path / "run", "--rate", "0", says="--rate 0: give")
     refused(capsys, "evaluate", "x.glb", "--out", tmp_path / "e", "--methods", "lift,magic", says="no such method")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Presets of the settings: Draft, Balanced and Fine, and those that artists make."""
+"""Presets of the settings: the qualities, each with pictures of its size, and those that artists make."""
 
 import bpy
 from bl_operators.presets import AddPresetBase
@@ -7,20 +7,22 @@ from bpy.props import EnumProperty
 
 from .. import settings
 
-PRESETS = {  # what they differ in
-    "DRAFT": {"size": 128, "samples": 8, "method": "tracks", "budget": "ALL", "refine": 0.0},
-    "BALANCED": {"size": 256, "samples": 16, "method": "tracks", "budget": "ALL", "refine": 15.0},
-    "FINE": {"size": 512, "samples": 16, "method": "tracks", "budget": "ALL", "refine": 90.0},
+PRESETS = {  # what they set
+    "DRAFT": {"size": 128, "samples": 8, "method": "tracks", "budget": "ALL", "quality": "DRAFT"},
+    "BALANCED": {"size": 256, "samples": 16, "method": "tracks", "budget": "ALL", "quality": "BALANCED"},
+    "FINE": {"size": 512, "samples": 16, "method": "tracks", "budget": "ALL", "quality": "FINE"},
+    "BEST": {"size": 1024, "samples": 16, "method": "tracks", "budget": "ALL", "quality": "BEST"},
 }
 PRESET_ITEMS = [
-    ("DRAFT", "Draft", "Small pictures, and their colours as they are: nothing is fitted"),
-    ("BALANCED", "Balanced", "Pictures of 256 pixels, a fit of a quarter of a minute"),
-    ("FINE", "Fine", "Larger pictures, a longer fit"),
+    ("DRAFT", "Draft", "Small pictures and a short fit: whether it works at all"),
+    ("BALANCED", "Balanced", "Pictures of 256 pixels"),
+    ("FINE", "Fine", "Pictures of 512 pixels, a longer fit"),
+    ("BEST", "Best", "Pictures of 1024 pixels, and time"),
 ]
 
 
 class TIMESPLAT_OT_preset(bpy.types.Operator):
-    """Choose resolution, samples, method, refinement and number of Gaussians at once"""
+    """Choose resolution, samples, method, quality and number of Gaussians at once"""
 
     bl_idname = "timesplat.preset"
     bl_label = "Timesplat Preset"

@@ -73,6 +73,7 @@ def request(chosen, context) -> dict:
         "size": chosen.size,
         "samples": chosen.samples,
         "passes": getattr(chosen, "method", "") != "rgb",
+        "tracks": getattr(chosen, "method", "") in ("", "tracks"),
         "lighting": chosen.lighting,
     }
 
@@ -102,7 +103,7 @@ def start(chosen, context) -> jobs.Job:
     asked = {
         "task": "reconstruct",
         "method": chosen.method,
-        "refine": chosen.refine,
+        **settings.fit(chosen),
         "budget": settings.budget(chosen),
         "device": worker_options.device(context),
         "checkpoint": checkpoint or worker_options.checkpoint(context),
@@ -112,7 +113,8 @@ def start(chosen, context) -> jobs.Job:
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
         method = event.get("method", asked["method"])
-        if not asked["budget"] and (method == "tracks" or not asked["refine"]):  # a fit of tracks keeps nearly all
+        fitted = asked["quality"] or (asked["refine"] and method != "tracks")  # a fit of tracks keeps nearly all
+        if not (asked["budget"] or fitted):  # else their number is not the pixels' alone
             estimates.learn_number(method, len(asset), expected.pictures, size)
         ob = add_asset(asset, "Timesplat", look=look, context=bpy.context)
         originals.note_in(ob)

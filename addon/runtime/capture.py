@@ -4,6 +4,7 @@ objects    full names of what is captured       cameras    full names of cameras
 rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
 frames     scene frames                         in_turn    one camera a frame, instead of all of them
 size, samples, passes, lighting                 as `datagen.render_setup.CaptureSettings` has them
+tracks     (optional) whether surfaces are followed (true)
 sequence   folder to write
 """
 
@@ -77,7 +78,8 @@ def _capture(request: dict, progress) -> dict:
     def rendered(done: int, total: int) -> None:
         progress(0.05 + 0.95 * done / total, f"rendering: picture {done} of {total}")
 
-    settings = CaptureSettings(**{key: request[key] for key in ("size", "samples", "passes", "lighting")})
+    wanted = {key: request[key] for key in ("size", "samples", "passes", "lighting")}
+    settings = CaptureSettings(**wanted, tracks=0 if request.get("tracks", True) else None)
     subject = Subject(frames, norm, aabb, objects)
     provenance = {"asset": request["name"], **tool_versions(), "scene_frames": frames}
     capture(shots, Path(request["sequence"]), subject, settings, provenance=provenance, progress=rendered)

@@ -107,7 +107,9 @@ class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
         layout, chosen = self.layout, context.scene.timesplat
         layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(chosen, "method")
-        layout.prop(chosen, "refine")
+        layout.prop(chosen, "quality")
+        if chosen.quality == "SECONDS":
+            layout.prop(chosen, "refine")
         layout.prop(chosen, "budget")
         if chosen.budget in ("SHARE", "NUMBER"):
             layout.prop(chosen, chosen.budget.lower(), text=" ")

@@ -27,7 +27,10 @@ def _static(reconstruct: Callable, views: Views, options: ReconstructOptions, pr
 
 
 def _fitted(fit: Callable, views: Views, options: ReconstructOptions, progress: Progress | None):
-    return fit(views, fitting_device(options.device), options.seconds, progress=progress)
+    how: dict = {"steps": options.steps, "seed": options.seed, "progress": progress}
+    if quality := options.named_quality:
+        how |= {"steps": quality.steps, "max_gaussians": quality.gaussians}
+    return fit(views, fitting_device(options.device), options.seconds, **how)
 
 
 register(

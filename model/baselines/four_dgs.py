@@ -21,21 +21,27 @@ from ..gaussians import Gaussians4D
 from ..views import Views
 
 POINTS = 8000  # at the start; most lie outside of the object and fade
-MAX_GAUSSIANS = 12000  # densification stops there
+MAX_GAUSSIANS = 12000  # densification stops there, where no other number is asked for
 SIGMA_T, SCALE, OPACITY = 0.25, 0.04, 0.1  # of a Gaussian at the start; σ_t an eighth of the clip
 OPACITY_WEIGHT = 0.04  # of mean opacity, in the loss, times the share of the pictures that the object covers
 
 
 def four_dgs(
-    views: Views, device: str = "cpu", seconds: float = 10.0, steps: int | None = None, seed: int = 0, progress=None
+    views: Views,
+    device: str = "cpu",
+    seconds: float = 10.0,
+    steps: int | None = None,
+    seed: int = 0,
+    max_gaussians: int = MAX_GAUSSIANS,
+    progress=None,
 ) -> Gaussians4D:
-    """Views (RGB and alpha alone are used) -> Gaussians4D (N,) on the CPU, after `seconds`, or `steps` where given.
-    For `progress` see `optimise`."""
+    """Views (RGB and alpha alone are used) -> Gaussians4D (N,) on the CPU, after `seconds`, or `steps` where given, and
+    no more than `max_gaussians`. For `progress` see `optimise`."""
     with gradients():
         views = detached(views, device)
         generator = torch.Generator().manual_seed(seed)
-        p = Parameters(random_points(views, generator), RATES)
-        densifier = Densifier(p, generator, MAX_GAUSSIANS)
+        p = Parameters(random_points(views, generator, min(POINTS, max_gaussians)), RATES)
+        densifier = Densifier(p, generator, max_gaussians)
         weight = OPACITY_WEIGHT * views.alpha.mean()
 
         def loss(step: Step) -> Tensor:
@@ -54,9 +60,9 @@ def four_dgs(
         return activate(p.values).map(Tensor.detach).to("cpu")
 
 
-def random_points(views: Views, generator: torch.Generator) -> dict[str, Tensor]:
-    """Raw parameters of POINTS Gaussians anywhere in the box, at any time, in the object's mean colour."""
-    n, weight = POINTS, views.alpha[..., None]
+def random_points(views: Views, generator: torch.Generator, n: int = POINTS) -> dict[str, Tensor]:
+    """Raw parameters of `n` Gaussians anywhere in the box, at any time, in the object's mean colour."""
+    weight = views.alpha[..., None]
     raw = {
         "xyz": 2 * torch.rand(n, 3, generator=generator) - 1,
         "t": 2 * torch.rand(n, generator=generator) - 1,

@@ -110,15 +110,22 @@ def clusters(points: Tensor, count: int, generator) -> Tensor:
 
 
 def shape_of_motion(
-    views: Views, device: str = "cpu", seconds: float = 10.0, steps: int | None = None, seed: int = 0, progress=None
+    views: Views,
+    device: str = "cpu",
+    seconds: float = 10.0,
+    steps: int | None = None,
+    seed: int = 0,
+    max_gaussians: int = POINTS,
+    progress=None,
 ) -> Motion | Gaussians4D:
-    """Views (RGB and alpha alone are used) -> Motion on the CPU, after `seconds`, or `steps` where given; where
-    no view shows the object, nothing (`white`). For `progress` see `optimise`."""
+    """Views (RGB and alpha alone are used) -> Motion of POINTS, or `max_gaussians` if that is less, on the CPU, after
+    `seconds`, or `steps` where given; where no view shows the object, nothing (`white`). For `progress` see
+    `optimise`."""
     start = work_clock()
     with gradients():
         views = detached(views)
         generator = torch.Generator().manual_seed(seed)
-        g = canonical(views, generator)
+        g = canonical(views, generator)[:max_gaussians]
         if not len(g):
             return white(views)
         moments = views.time.unique()
@@ -144,6 +151,7 @@ def shape_of_motion(
             views,
             loss,
             Schedule(seconds=seconds - (work_clock() - start), steps=steps, seed=seed),
+            generator=generator,
             text="som",
             progress=progress,
         )

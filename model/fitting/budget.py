@@ -23,7 +23,7 @@ from .refine import Few, enlargement, fit_few, part, refine
 
 SECONDS = 5.0  # of fitting, where none are asked for, at 128²; in proportion to the pixels above
 FIRST_TRY = 500  # Gaussians; then twice as many, and so on
-TRY_SECONDS = 1.5
+TRY_SECONDS, TRY_STEPS = 1.5, 150  # of each; the steps where nothing else goes by the clock either
 MIN_CONTRIBUTION = 1.0  # pixels of a Gaussian in all of the pictures from around together: a twentieth have less
 HELD_OUT = 6  # input views
 
@@ -49,23 +49,28 @@ def apply_budget(
     *,
     has_depth: bool,
     max_loss: float = 0.1,
+    steps: int | None = None,
+    seed: int = 0,
     device: str = "cpu",
     progress=None,
 ) -> Gaussians4D:
     """A prediction `start` (N,) from these views (has_depth: with depth and motion) -> no more Gaussians than `budget`
-    says, refined for `seconds`, or SECONDS where 0; nor more than refinement uses by itself, but for auto, which
-    keeps within `max_loss` dB. Raises InputError, also for a scene that is not of 4D Gaussians."""
+    says, refined by `steps`, or for `seconds`, or SECONDS where 0; nor more than refinement uses by itself, but for
+    auto, which keeps within `max_loss` dB. Raises InputError, also for a scene that is not of 4D Gaussians."""
     wanted, search = parse_budget(budget), 0.0
     if wanted is None and isinstance(start, Gaussians4D):
         search = 0.5  # of what is reported
         told = part(progress, 0, search)
-        wanted, _ = find_fewest(start, views, max_loss, has_depth=has_depth, device=device, progress=told)
+        tries = None if steps is None else TRY_STEPS
+        how = {"has_depth": has_depth, "device": device, "progress": told, "steps": tries, "seed": seed}
+        wanted, _ = find_fewest(start, views, max_loss, **how)
     elif isinstance(start, Gaussians4D):
         share = wanted * int(start.alive().sum()) if isinstance(wanted, float) else wanted
         wanted = max(min(int(share), Few.of(has_depth).limit(views)), 1)
     told = part(progress, search, 1)
     seconds = seconds or SECONDS * max(enlargement(views), 1.0)
-    g = refine(start, views, seconds, device, has_depth=has_depth, max_gaussians=wanted, progress=told)
+    how_long = {"seconds": seconds if steps is None else 0.0, "steps": steps, "seed": seed}
+    g = refine(start, views, device=device, has_depth=has_depth, max_gaussians=wanted, progress=told, **how_long)
     with gradients():
         g = g.map(torch.clone)
         if len(g) == 0:
@@ -78,11 +83,19 @@ def apply_budget(
 
 
 def find_fewest(
-    start: Gaussians4D, views: Views, max_loss: float, *, has_depth: bool, device: str = "cpu", progress=None
+    start: Gaussians4D,
+    views: Views,
+    max_loss: float,
+    *,
+    has_depth: bool,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    progress=None,
 ) -> tuple[int, list[tuple[int, float]]]:
-    """-> the fewest Gaussians that come within `max_loss` dB of twice as many, after fits of TRY_SECONDS, on HELD_OUT
-    input views, which are not fitted; and what was tried: (number, PSNR in dB there). Raises InputError for a
-    `max_loss` that is not above 0."""
+    """-> the fewest Gaussians that come within `max_loss` dB of twice as many, after fits of `steps`, or of
+    TRY_SECONDS, on HELD_OUT input views, which are not fitted; and what was tried: (number, PSNR in dB there). Raises
+    InputError for a `max_loss` that is not above 0."""
     if not max_loss > 0:
         raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
     with gradients():
@@ -91,7 +104,7 @@ def find_fewest(
         held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
         fitted, unseen = views[[i for i in range(len(views)) if i not in held_out] or held_out], views[held_out]
         extra_views = views_around(g, views) if has_depth else None
-        schedule = Schedule(seconds=TRY_SECONDS, coarse_size=None)
+        schedule = Schedule(seconds=TRY_SECONDS, steps=steps, coarse_size=None, seed=seed)
         tried: list[tuple[int, float]] = []
         number = FIRST_TRY
         while number < len(g):

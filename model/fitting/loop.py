@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fitting a scene to its views by gradient descent, for a number of seconds: the loop that per-scene methods
-share. What the scene is made of, and how, is the caller's; any `DynamicScene` scene or Gaussians4D will do."""
+"""Fitting a scene to its views by gradient descent, for a number of steps or of seconds: the loop that per-scene
+methods share. What the scene is made of, and how, is the caller's; any `DynamicScene` scene or Gaussians4D will do."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ from ..rasterize import render
 from ..views import Views
 from .fit_views import downsampled, joined, reduction
 from .parameters import Parameters
+from .plan import PROBE_SHARE, Costs, Plan, TimedPlan
 
 ALPHA_WEIGHT = 0.3  # of the error in alpha against that in colour
-COARSE, COARSE_UNTIL = 160, 0.6  # longest side in pixels of what is drawn in this first part of the budget
+COARSE, COARSE_UNTIL = 160, 0.6  # longest side in pixels of what is drawn in this first part of the schedule
+PROBES = 5  # steps at the most, of each size of pictures, by which the speed is measured
 PHOTO_SHARE = (0.2, 0.8)  # share of a step's views that are photographs, at the start and the end, beside extra views
 
 
@@ -30,19 +32,12 @@ PHOTO_SHARE = (0.2, 0.8)  # share of a step's views that are photographs, at the
 class Schedule:
     """How long a fit goes on, and what its steps draw."""
 
-    seconds: float = 0.0
+    seconds: float = 0.0  # as many steps as fit, planned by the speed of the first
     steps: int | None = None  # exactly so many, in place of seconds: then the result is the same on every run
     max_steps: int | None = None  # time that is left after these stays unused
     batch: int = 2  # views of a step
     coarse_size: int | None = COARSE  # longest side in pixels of the pictures at first; None: as they are, always
     seed: int = 0
-
-    def fraction(self, elapsed: float, done: int) -> float:
-        """The share 0..1 of the budget that is spent after `elapsed` seconds and `done` steps."""
-        spent, budget = (elapsed, self.seconds) if self.steps is None else (done, self.steps)
-        if budget <= 0:
-            return 1.0
-        return min(max(spent / budget, done / self.max_steps if self.max_steps else 0.0), 1.0)
 
 
 @dataclass
@@ -54,7 +49,7 @@ class Step:
     views: Views  # the B views that were drawn
     background: Tensor  # (3,)
     scene: Gaussians4D | DynamicScene
-    fraction: float  # of the budget spent, 0..1
+    fraction: float  # of the schedule that is done, 0..1
 
 
 @contextmanager
@@ -107,22 +102,33 @@ class _Batches:
         views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
         return views, torch.rand(3, generator=self.generator).to(views.rgb)
 
+    def probe(self, number: int, fraction: float) -> tuple[Views, Tensor]:
+        """Views and background as above, of the `number`-th step of those by which the speed is measured; nothing is
+        taken for it."""
+        chosen = [(number * self.size + i) * 7919 % len(self.views) for i in range(self.size)]  # all over the clip
+        views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
+        return views, views.rgb.new_full((3,), 0.5)
+
 
 class _Report:
-    """Tells the callback about ten times a second how far a fit is; without one a bar shows on a terminal after two
-    seconds."""
+    """Tells the callback about ten times a second how far a fit is, and at once what is to be said of its plan; without
+    one a bar shows on a terminal after two seconds."""
 
     def __init__(self, text: str, progress: Callable[[float, str], None] | None):
         self.text, self.progress, self.told = text, progress, 0.0
         self.bar = tqdm(total=100, desc=text, unit="%", delay=2, leave=False, disable=True if progress else None)
 
-    def __call__(self, fraction: float, elapsed: float, done: int) -> None:
+    def __call__(self, fraction: float, elapsed: float, done: int, steps: int) -> None:
         if elapsed - self.told <= 0.1 and fraction < 1:
             return
         self.told = elapsed
         self.bar.update(math.floor(100 * fraction) - self.bar.n)
         if self.progress:
-            self.progress(fraction, f"{self.text}, step {done}")
+            self.progress(fraction, f"{self.text}, step {done} of {steps}")
+
+    def say(self, fraction: float, sentence: str) -> None:
+        if self.progress and sentence:
+            self.progress(fraction, f"{self.text}: {sentence}")
 
 
 def draw(scene: Gaussians4D | DynamicScene, views: Views, background: Tensor, fraction: float) -> Step:
@@ -142,6 +148,7 @@ def optimise(
     *,
     extra_views: Views | None = None,
     after_backward: Callable[[int, float], None] | None = None,
+    generator: torch.Generator | None = None,
     text: str = "optimising",
     progress: Callable[[float, str], None] | None = None,
 ) -> int:
@@ -149,17 +156,25 @@ def optimise(
 
     A step draws `scene()` from a few of the views over a random colour, and descends on `loss(step)`. `extra_views`,
     where given, make up the rest of a step's share PHOTO_SHARE of `views`. `after_backward(number, fraction)` may
-    change the parameters' rows after a step, while their gradients are still there. `progress(fraction, text)` is
-    called about ten times a second. Call inside of `gradients()`, with views from `detached`."""
-    batches = _Batches(views, extra_views, schedule)
-    if schedule.steps is None:
+    change the parameters' rows after a step, while their gradients are still there. `generator` is what `scene` and
+    `loss` take random numbers from, if they do: measuring the speed leaves it as it was. `progress(fraction, text)` is
+    called about ten times a second, and with a line that has "planned" in it when steps are planned for seconds.
+    Call inside of `gradients()`, with views from `detached`."""
+    batches, report = _Batches(views, extra_views, schedule), _Report(text, progress)
+    timed = schedule.steps is None and schedule.seconds > 0
+    if timed:
         warm_up(views.rgb.device.type)
-    start, done = work_clock(), 0
-    report = _Report(text, progress)
+    start, done, plan = work_clock(), 0, Plan(schedule.steps or 0)
+    if timed:
+        costs = _measured(parameters, scene, loss, batches, PROBE_SHARE * schedule.seconds, generator)
+        plan = TimedPlan(schedule.seconds, costs, work_clock() - start, schedule.max_steps)
+        report.say(0.0, f"planned {plan.steps:,} steps of {schedule.batch} views in {schedule.seconds:.3g} s")
     while True:
         elapsed = work_clock() - start
-        fraction = schedule.fraction(elapsed, done)
-        report(fraction, elapsed, done)
+        sentence = plan.look(elapsed, done)
+        fraction = plan.fraction(done)
+        report.say(fraction, sentence)
+        report(fraction, elapsed, done, plan.steps)
         if fraction >= 1:
             report.bar.close()
             return done
@@ -169,6 +184,42 @@ def optimise(
         if after_backward:
             after_backward(done, fraction)
         parameters.step(fraction)
+
+
+def _measured(
+    parameters: Parameters,
+    scene: Callable[[], Gaussians4D | DynamicScene],
+    loss: Callable[[Step], Tensor],
+    batches: _Batches,
+    seconds: float,
+    generator: torch.Generator | None,
+) -> Costs:
+    """What a step costs with small pictures and with whole ones: the median of some, taken as far as their gradients,
+    that leave parameters and random numbers as they were. They take about so many seconds, or a step."""
+    device = batches.views.rgb.device
+    state = generator.get_state() if generator else None
+
+    def cost(fraction: float, seconds: float) -> float:
+        taken: list[float] = []
+        while len(taken) < PROBES and (not taken or sum(taken) + taken[-1] <= seconds):
+            begun = work_clock()
+            seen, background = batches.probe(len(taken), fraction)
+            loss(draw(scene(), seen, background, fraction)).backward()
+            for value in parameters.values.values():
+                value.grad = None
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            taken.append(work_clock() - begun)
+        return sorted(taken)[(len(taken) - 1) // 2]
+
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        coarse = full = cost(0.0, seconds / 2)
+        larger = batches.views.alpha[0].numel() / batches.coarse.alpha[0].numel()
+        if larger > 1:  # steps that would take too long are taken to cost by their pixels
+            full = cost(COARSE_UNTIL, seconds / 2) if larger * coarse <= seconds else larger * coarse
+    if generator:
+        generator.set_state(state)
+    return Costs(coarse, full, COARSE_UNTIL)
 
 
 @cache

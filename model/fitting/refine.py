@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Test-time refinement: predicted 4D Gaussians fitted to the input views for some seconds, by gradient descent.
+"""Test-time refinement: predicted 4D Gaussians fitted to the input views for some steps, by gradient descent.
 
 One view a moment says little about a scene, and is soon learnt by heart (33 dB on the inputs where other views
 gain nothing any more). What keeps it from that:
@@ -89,13 +89,20 @@ class All:
     little."""
 
     rates: dict[str, tuple[float, float]]  # learning rates at the start and at the end
-    enough: float  # seconds, for pictures of PIXELS, up to which they are never merged: some 80 steps
-    share: float  # of more seconds that come before they are merged …
-    longest: float  # … and so many seconds at most
+    enough: float  # seconds, for pictures of PIXELS, up to which they are never merged …
+    enough_steps: int  # … or, where steps are given, so many
+    share: float  # of more of them that come before they are merged …
+    longest: float  # … and so many seconds at most …
+    longest_steps: int  # … or steps
 
-    def part(self, seconds: float, enlarged: float) -> float:
-        """The share 0..1 of `seconds` (0: a number of steps is given) for pictures `enlarged` times PIXELS."""
-        return min(self.share, self.longest * enlarged / seconds if seconds else 1.0)
+    def is_enough(self, seconds: float, steps: int | None, enlarged: float) -> bool:
+        """Whether nothing is merged in so many seconds or steps, for pictures `enlarged` times PIXELS."""
+        return seconds <= self.enough * enlarged if steps is None else steps <= self.enough_steps
+
+    def part(self, seconds: float, steps: int | None, enlarged: float) -> float:
+        """The share 0..1 of them that comes before merging."""
+        most = self.longest * enlarged / max(seconds, 1e-9) if steps is None else self.longest_steps / max(steps, 1)
+        return min(self.share, most)
 
 
 # Places are right to a pixel. (Four times the rate of opacity, with a weight on it, won a little more on clouds of
@@ -112,8 +119,10 @@ ALL = All(
         "opacity": (3e-2, 1e-2),
     },
     enough=4.0,
+    enough_steps=80,
     share=0.3,
     longest=3.0,
+    longest_steps=60,
 )
 
 
@@ -143,7 +152,7 @@ def part(progress, first: float, last: float):
 def refine(
     start: Gaussians4D | ReconstructedScene,
     views: Views,
-    seconds: float,
+    seconds: float = 0.0,
     device: str = "cpu",
     *,
     has_depth: bool = False,
@@ -175,10 +184,10 @@ def refine(
         views = detached(views, device)
         start_error, better = squared_error(g, views[validation_views(views)]), None
         enlarged = enlargement(views)
-        merging = not has_depth or max_gaussians is not None or seconds > ALL.enough * enlarged
+        merging = not has_depth or max_gaussians is not None or not ALL.is_enough(seconds, steps, enlarged)
         first = 0.0  # share of the budget that comes before merging
         if has_depth:
-            first = ALL.part(seconds, enlarged) if merging else 1.0
+            first = ALL.part(seconds, steps, enlarged) if merging else 1.0
             schedule = Schedule(
                 seconds=first * seconds,
                 steps=None if steps is None else round(first * steps),

@@ -22,6 +22,7 @@ from .budget import FIRST_TRY, HELD_OUT, parse_budget
 from .fit_tracks import FIT, fit_tracks
 from .fit_views import squared_error, validation_views
 from .loop import Schedule, warm_up
+from .quality import Quality
 from .refine import part
 
 TRY_STEPS = 150  # of each fit by which `auto` looks for the fewest
@@ -34,11 +35,14 @@ def reconstruct_tracks(
     budget: str | None = None,
     max_loss: float = 0.1,
     steps: int | None = None,
+    quality: Quality | None = None,
+    seed: int = 0,
     progress=None,
 ) -> Tracks4D:
     """Views with depth, motion vectors and, where the renderer wrote them, tracks of the surface -> tracks, after at
-    most `seconds` of fitting, or exactly `steps`; as they start for 0. budget: see `parse_budget`; a share is of the
-    points that the pixels need. max_loss: dB that `auto` may lose. Raises InputError where nothing can be followed."""
+    most `seconds` of fitting, or exactly `steps`, or the steps of `quality`, but no more than these views are worth,
+    and no more tracks than it says; as they start for 0. budget: see `parse_budget`; a share is of the points that the
+    pixels need. max_loss: dB that `auto` may lose. Raises InputError where nothing can be followed."""
     surface, search = followed(views), 0.0
     count = None
     if budget:
@@ -48,15 +52,19 @@ def reconstruct_tracks(
             count = fewest(surface, views, max_loss, progress=part(progress, 0, search))
         else:
             count = max(round(wanted * needed) if isinstance(wanted, float) else wanted, 1)
+    most = max(FIT.least_steps, FIT.steps_a_view * len(views))
+    limit = count
+    if quality:
+        steps, limit = min(quality.steps, most), min(count or quality.gaussians, quality.gaussians)
+        count = min(limit, needed_points(surface, views))
     start = surface_tracks(surface, views, count)
     if not (seconds or steps) or not len(start):
         return start
-    most = max(FIT.least_steps, FIT.steps_a_view * len(views))
-    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None)
+    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None, seed=seed)
     told = part(progress, search, 1)
     warm_up("cpu")
     fitted = fit_tracks(start, views, schedule, pixel=pixel_size(views), progress=told)
-    return fitted if not count or len(fitted) <= count else fitted[fitted.opacity.topk(count).indices]
+    return fitted if not limit or len(fitted) <= limit else fitted[fitted.opacity.topk(limit).indices]
 
 
 def followed(views: Views) -> SurfaceTracks:

@@ -61,6 +61,11 @@ for budget, refine, size in (("ALL", 0, 128), ("ALL", 9, 256), ("SHARE", 0, 128)
 estimates.learn_number("tracks", 9000, 5, 128)
 chosen.size = 256
 counts["tracks learnt"] = estimates.estimate(chosen, bpy.context).gaussians
+chosen.every = 1  # 250 pictures
+for method, quality, size in (("tracks", "DRAFT", 256), ("tracks", "FINE", 512), ("lift", "DRAFT", 128)):
+    chosen.method, chosen.quality, chosen.size = method, quality, size
+    e = estimates.estimate(chosen, bpy.context)
+    counts[f"{method} {quality} {size}"] = [e.gaussians, e.reconstructing]
 tell(counts=counts, ranges=ranges, everything=everything, selected=selected, collected=collected, own=own, said=said,
      estimates=pictures)
 """
@@ -98,4 +103,13 @@ def test_what_the_settings_select(blender):
     ]
     assert counts["tracks SHARE 0 128"][0] == round(0.063 * 128**2) and counts["tracks learnt"] == 4 * 9000
     assert counts["tracks SHARE 0 128"][1] == counts["tracks ALL 0 128"][1]
+    step = {n: 128**2 * 3e-7 + n * 1e-6 for n in (10_000, 4000)}  # a quality's seconds are those of its steps
+    for key, taken in (("tracks DRAFT 256", 300 * step[10_000]), ("lift DRAFT 128", 300 * step[4000])):
+        method, _, size = key.split()
+        assert counts[key][0] == (10_000 if method == "tracks" else 4000)
+        a_pixel = 1e-6 if method == "tracks" else 8e-7
+        assert counts[key][1] == pytest.approx(3 + 250 * int(size) ** 2 * a_pixel + taken)
+    assert counts["tracks FINE 512"][1] == pytest.approx(
+        3 + 250 * 512**2 * 1e-6 + 4000 * (512**2 * 3e-7 + 100_000 * 1e-6)
+    )
     assert counts["tracks ALL 9 256"] == [round(0.63 * 256**2), pytest.approx(3 + 9 + 5 * 256**2 * 1e-6)]

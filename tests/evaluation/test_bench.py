@@ -71,6 +71,24 @@ def rows_of(
     return rows
 
 
+def test_lines_join_qualities_and_numbers_of_steps():
+    ways = ("tracks:3", "tracks:1", "tracks+quality:fine", "tracks+quality:draft", "tracks+steps:20", "guided")
+    ways += ("guided+quality:draft", "guided+quality:draft+budget:9", "guided+budget:9")
+    means = [m for m in summarise(rows_of(ways), ("random", 128)) if (m.setup, m.size) == ("random", 128)]
+    joined = {k: [m.method.label for m in line] for k, line in charts.lines(means).items()}
+    assert joined == {
+        "tracks": ["tracks:1", "tracks:3"],
+        "tracks+quality": ["tracks+quality:draft", "tracks+quality:fine"],
+        "tracks+steps": ["tracks+steps:20"],
+        "guided": ["guided"],
+        "guided+quality": ["guided+quality:draft"],
+        "guided+quality:draft+budget": ["guided+quality:draft+budget:9", "guided+quality:draft"],
+        "guided+budget": ["guided+budget:9", "guided"],
+    }
+    hints = {charts.hint(m) for m in means}
+    assert hints == {"3 s", "1 s", "fine", "draft", "20 steps", "", "9"}
+
+
 FACTS = {
     "date": "2026-01-01",
     "machine": {"cpu": "Abacus", "cores": 2, "system": "Linux"},

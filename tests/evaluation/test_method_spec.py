@@ -26,6 +26,17 @@ def test_every_part():
     assert parse_spec("4dgs", seconds=7).seconds == 7 and parse_spec("lift", seconds=7).seconds is None
 
 
+def test_what_goes_by_steps_has_no_seconds_and_prints_of_its_own():
+    draft, counted = parse_spec("tracks+quality:draft", seconds=7), parse_spec("mine=guided+steps:40+budget:10%")
+    assert (draft.label, draft.quality, draft.seconds, draft.counted) == ("tracks+quality:draft", "draft", None, 300)
+    assert (counted.label, counted.steps, counted.refine, counted.counted) == ("mine", 40, None, 40)
+    assert draft.fitted and counted.fitted and not parse_spec("guided").fitted and not parse_spec("tracks:3").counted
+    texts = ("tracks", "tracks:10", "tracks+quality:draft", "tracks+quality:fine", "tracks+steps:300", "tracks+steps:1")
+    assert len({parse_spec(t).fingerprint for t in texts}) == len(texts)
+    assert parse_spec("lift").fingerprint == "lift None None None False -"  # as rows have it that were kept before
+    assert draft.fit_seconds < parse_spec("tracks+quality:best").fit_seconds
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -35,6 +46,11 @@ def test_every_part():
         ("lift+refine:1+refine:2", "given twice"),
         ("lift+budget:0%", "a number of Gaussians"),
         ("lift:3", "take seconds"),
+        ("tracks+quality:superb", "write .*quality:NAME"),
+        ("tracks:3+quality:draft", "tracks:3.quality:draft: seconds and quality: .*; give one of them"),
+        ("guided+quality:draft+steps:3", "quality and steps: .*; give one of them"),
+        ("guided+refine:3+steps:3", "steps and refine: .*; give one of them"),
+        ("4dgs+steps:0", "0 steps: give 1 or more"),
         ("guided@huge", "no checkpoint huge"),
         ("predicted@nothing.safetensors", "no checkpoint nothing"),
         ("", "write .*METHOD"),

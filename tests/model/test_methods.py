@@ -48,6 +48,11 @@ def test_without_baselines_there_are_the_products_methods():
         ({"refine": -1.0}, "-1 seconds of refinement: give 0 or more"),
         ({"refine": float("nan")}, "seconds of refinement"),
         ({"budget": "some"}, "some: no budget"),
+        ({"quality": "superb"}, "superb: no such quality; choose one of draft, balanced, fine, best"),
+        ({"steps": 0}, "0 steps: give 1 or more"),
+        ({"quality": "draft", "steps": 3}, "quality and steps: .* give one of them"),
+        ({"steps": 3, "refine": 3.0}, "steps and refine: .* give one of them"),
+        ({"quality": "draft", "refine": 3.0}, "quality and refine: .* give one of them"),
     ],
 )
 def test_impossible_options_are_refused(options, word):

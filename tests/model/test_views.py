@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cameras to rays, checked by projecting back, and padding that changes nothing that is seen."""
+"""Cameras to rays, checked by projecting back, padding that changes nothing that is seen, and smaller pictures."""
 
 from dataclasses import replace
 

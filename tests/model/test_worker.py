@@ -97,6 +97,8 @@ def test_bad_requests_are_answered_with_one_sentence(request_, word):
     [
         ({"refine": -1}, "-1 seconds of refinement: give 0 or more"),
         ({"budget": "half"}, "half: no budget"),
+        ({"quality": "superb"}, "superb: no such quality"),
+        ({"quality": "draft", "refine": 1}, "quality and refine: each says how long"),
         ({"budget": "auto", "max_loss": 0}, "0 dB of loss"),
         ({"indices": [0, 99]}, "it has no view 99; give numbers from 0 to 3"),
         ({"indices": ["a"]}, "it has no view 'a'"),

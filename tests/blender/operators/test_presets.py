@@ -1,27 +1,55 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Presets: what the three set, and that each is more work than the one before."""
+"""Presets: what they set, that each is more work than the one before, and what the worker and the capture are asked."""
 
+from dataclasses import astuple
+
+from timesplat.model.fitting.fit_tracks import FIT
+from timesplat.model.fitting.quality import QUALITIES
+from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB
 from timesplat.model.methods import METHODS
 
 PRESETS = """
 part("addon").register()
-presets, estimates = part("addon.operators.presets"), part("addon.estimates")
+presets, estimates, settings = part("addon.operators.presets"), part("addon.estimates"), part("addon.settings")
+reconstruct = part("addon.operators.reconstruct")
 chosen = bpy.context.scene.timesplat
-default, told = chosen.method, {}
+default, told, followed = [chosen.method, settings.fit(chosen)], {}, {}
 for key, *_ in presets.PRESET_ITEMS:
     chosen.method, chosen.budget = "rgb", "NUMBER"
     bpy.ops.timesplat.preset(preset=key)
     e = estimates.estimate(chosen, bpy.context)
     same = [getattr(chosen, k) == v for k, v in presets.PRESETS[key].items()]
-    told[key] = [all(same), chosen.method, chosen.budget, e.rendering + e.reconstructing, e.gaussians]
-tell(default=default, presets=told, methods=[m[0] for m in part("addon.settings").METHODS])
+    told[key] = [all(same), chosen.method, chosen.budget, settings.fit(chosen), chosen.size, e.reconstructing,
+                 e.gaussians]
+for method, *_ in settings.METHODS:
+    chosen.method = method
+    shot = reconstruct.request(chosen, bpy.context)
+    followed[method] = [shot["tracks"], shot["passes"]]
+chosen.quality = "SECONDS"
+tell(default=default, presets=told, followed=followed, seconds=settings.fit(chosen), qualities=estimates.QUALITIES,
+     most=estimates.MOST_STEPS, tracks=estimates.TRACK_STEPS)
 """
 
 
-def test_the_three_presets(blender):
+def test_the_presets(blender):
     told = blender(PRESETS)
-    assert list(told["presets"]) == ["DRAFT", "BALANCED", "FINE"] and told["default"] == "tracks"
-    assert set(told["methods"]) <= set(METHODS)
-    work = [(seconds, gaussians) for *_, seconds, gaussians in told["presets"].values()]
+    assert [n.lower() for n in told["presets"]] == list(QUALITIES)
+    assert told["default"] == ["tracks", {"quality": None, "refine": 10.0}] and told["seconds"] == told["default"][1]
+    work = [(size, seconds, gaussians) for *_, size, seconds, gaussians in told["presets"].values()]
     assert work == sorted(work)
-    assert all(row[:3] == [True, "tracks", "ALL"] for row in told["presets"].values())
+    for (name, quality), (*same, fit, size, _, gaussians) in zip(
+        QUALITIES.items(), told["presets"].values(), strict=True
+    ):
+        assert same == [True, "tracks", "ALL"] and fit == {"quality": name, "refine": 0.0}
+        assert size == quality.size and gaussians <= quality.gaussians
+    assert told["followed"] == {
+        "tracks": [True, True], "guided": [False, True], "lift": [False, True], "rgb": [False, False],
+    }  # fmt: skip
+    assert set(told["followed"]) <= set(METHODS)
+
+
+def test_estimates_know_what_the_worker_does(blender):
+    told = blender(PRESETS)
+    assert {k.lower(): tuple(v) for k, v in told["qualities"].items()} == {k: astuple(q) for k, q in QUALITIES.items()}
+    assert told["most"] == {"guided": FROM_DEPTH.max_steps, "lift": FROM_DEPTH.max_steps, "rgb": FROM_RGB.max_steps}
+    assert told["tracks"] == [FIT.least_steps, FIT.steps_a_view]

@@ -381,6 +381,7 @@ def test_the_box_is_where_it_is(told, name):
     assert said == ""
     seq = read_sequence(Path(folder) / name)
     assert len({v.image.lower() for v in seq.views}) == len(seq.views)
+    assert not seq.tracks and not seq.untracked  # of use to another method
     for number, box in enumerate(expected.boxes):
         seen = [world_points(seq, i) for i in seq.select(frame=number)]
         points = np.concatenate([p for p, _, _ in seen])

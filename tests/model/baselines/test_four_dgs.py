@@ -35,4 +35,5 @@ def test_a_number_of_steps_gives_the_same_on_every_run_and_seconds_end(moving, s
     told = []
     options = ReconstructOptions(seconds=0.3)
     reconstruct_views(views, "4dgs", options, lambda fraction, text: told.append((fraction, text)))
-    assert told == sorted(told) and told[-1] == (1, "4dgs, step 29")
+    assert told[0] == (0, "4dgs: planned 27 steps of 2 views in 0.3 s")
+    assert told == sorted(told, key=lambda t: t[0]) and told[-1] == (1, "4dgs, step 26 of 26")

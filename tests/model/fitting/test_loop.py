@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The optimisation loop: small pictures first, budgets in seconds and in steps."""
+"""The optimisation loop: small pictures first, so many steps, and seconds planned in steps by measuring a few."""
 
 import pytest
 import torch
@@ -9,12 +9,6 @@ from timesplat.model.fitting.fit_views import detached
 from timesplat.model.fitting.loop import Schedule, gradients, optimise, photometric_loss
 from timesplat.model.fitting.parameters import Parameters
 from timesplat.model.gaussians import Gaussians4D
-
-
-def test_a_schedule_says_what_share_is_spent():
-    assert Schedule(seconds=4).fraction(1.0, 99) == 0.25 and Schedule(seconds=4).fraction(9.0, 0) == 1
-    assert Schedule(seconds=4, steps=10).fraction(99.0, 5) == 0.5 and Schedule().fraction(0.0, 0) == 1
-    assert Schedule(seconds=4, max_steps=10).fraction(1.0, 5) == 0.5
 
 
 @pytest.mark.parametrize("size", [24, 200])
@@ -45,27 +39,76 @@ def test_a_blob_finds_its_colour_within_inference_mode(spheres, size):
         assert optimise(p, scene, mine, photometric_loss, Schedule(seconds=1e9, max_steps=3)) == 3
 
 
-def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatch):
-    """Each step takes a second of this clock, what makes the kernels ready a minute."""
-    now, told = [0.0], []
+ONE = torch.ones(1)
+
+
+def blob(p: Parameters) -> Gaussians4D:
+    turn = torch.tensor([[1.0, 0, 0, 0]])
+    return Gaussians4D(0 * p["rgb"], 0 * ONE, 0 * p["rgb"], ONE, torch.ones(1, 3), turn, p["rgb"], ONE)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The loop's clock, in a list: nothing but a test moves it."""
+    now = [0.0]
     monkeypatch.setattr(module, "work_clock", lambda: now[0])
-    monkeypatch.setattr(module, "warm_up", lambda device: now.append(now.pop() + 60))
-    one = torch.ones(1)
+    return now
+
+
+def test_seconds_are_those_of_the_steps_and_not_of_compiling(spheres, monkeypatch, clock):
+    """Each step takes a second of this clock, the one that is measured too; what makes the kernels ready a minute."""
+    told = []
+    monkeypatch.setattr(module, "warm_up", lambda device: clock.append(clock.pop() + 60))
     with gradients():
         views = detached(spheres([0, 12], size=16))
         p = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)})
 
-        def scene():
-            turn = torch.tensor([[1.0, 0, 0, 0]])
-            return Gaussians4D(0 * p["rgb"], 0 * one, 0 * p["rgb"], one, torch.ones(1, 3), turn, p["rgb"], one)
-
         def loss(step):
-            now[0] += 1
+            clock[0] += 1
             return photometric_loss(step)
 
         schedule = Schedule(seconds=8)
-        assert optimise(p, scene, views, loss, schedule, progress=lambda fraction, text: told.append(fraction)) == 8
-    assert told == [i / 8 for i in range(1, 9)]
+        steps = optimise(p, lambda: blob(p), views, loss, schedule, progress=lambda *said: told.append(said))
+    assert steps == 7
+    assert told[0] == (0, "optimising: planned 7 steps of 2 views in 8 s")
+    assert told[1:] == [(i / 7, f"optimising, step {i} of 7") for i in range(8)]
+
+
+def test_measuring_leaves_everything_as_it_was(spheres, clock):
+    """A fit for seconds is bit for bit the fit of as many steps as it planned, its random numbers included; both sizes
+    of pictures are measured, small ones several times."""
+    made, views = [], detached(spheres([0, 4, 8, 12], size=200))
+    for schedule in (Schedule(seconds=2.0), Schedule(steps=36)):
+        sizes, generator = [], torch.Generator().manual_seed(3)
+        torch.manual_seed(5)
+        with gradients():
+            p = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)})
+
+            def loss(step):
+                sizes.append(step.rgb.shape[1])  # noqa: B023
+                clock[0] += 0.02 if step.rgb.shape[1] == 100 else 0.1
+                noise = torch.rand((), generator=generator) + torch.rand(())  # noqa: B023
+                return photometric_loss(step) * noise
+
+            steps = optimise(p, lambda: blob(p), views, loss, schedule, generator=generator)  # noqa: B023
+        made.append((steps, p["rgb"].detach().clone(), torch.rand(2), torch.rand(2, generator=generator), sizes))
+    (steps, *timed, sizes), (_, *counted, plain) = made
+    assert steps == 36 and all(torch.equal(a, b) for a, b in zip(timed, counted, strict=True))
+    assert sizes[len(sizes) - steps :] == plain and set(sizes[: len(sizes) - steps]) == {100, 200}
+
+
+def test_a_step_that_takes_long_is_measured_once(spheres, clock):
+    with gradients():
+        views = detached(spheres([0, 12], size=200))
+        p, drawn = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)}), []
+
+        def loss(step):
+            drawn.append(step.rgb.shape[1])
+            clock[0] += (step.rgb.shape[1] / 100) ** 2
+            return photometric_loss(step)
+
+        steps = optimise(p, lambda: blob(p), views, loss, Schedule(seconds=12))
+    assert drawn[:2] == [100, 100] and len(drawn) == steps + 1 == 6  # 11 s of steps of 1, 1, 1, 4, 4
 
 
 def test_what_compiles_the_kernels_draws_and_steps(monkeypatch):
