@@ -108,6 +108,14 @@ def run_tracks(views: Views, options: ReconstructOptions, progress: Progress | N
     return reconstruct_tracks(views, seconds, steps=options.steps, quality=options.named_quality, **told)
 
 
+def run_deform(views: Views, options: ReconstructOptions, progress: Progress | None) -> ReconstructedScene:
+    from .deformation.fit import reconstruct_deform
+
+    seconds = options.refine or options.seconds
+    told = {"budget": options.budget, "seed": options.seed, "progress": progress}
+    return reconstruct_deform(views, seconds, steps=options.steps, quality=options.named_quality, **told)
+
+
 def load_predictor(options: ReconstructOptions) -> Callable[[Views], Gaussians4D]:
     """The network of options.checkpoint, from Views to Gaussians. Raises InputError as `load_network` does."""
     from .checkpoints_io import load_network
@@ -158,6 +166,13 @@ register(
         run_network,
         checkpoint="sweep",
         knows_surface=True,
+    ),
+    Method(
+        "deform",
+        "ours: one cloud moved by control points, both fitted to RGB alone; as tracks",
+        run_deform,
+        fits=True,
+        budgets=True,
     ),
     Method(
         "predicted",

@@ -29,6 +29,7 @@ LAYERS = {
         ("model.patches", "model.heads", "model.hexplane", "model.network"),
         ("model.checkpoints_io", "model.inference"),
         ("model.fitting",),
+        ("model.deformation",),
         ("model.methods",),
         ("model.reconstruct",),
         ("model.selftest",),

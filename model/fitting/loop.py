@@ -52,6 +52,9 @@ class Step:
     fraction: float  # of the schedule that is done, 0..1
 
 
+Choose = Callable[[float, int], list[int] | None]
+
+
 @contextmanager
 def gradients():
     """Gradients, even inside of `torch.inference_mode`. Tensors made out there must be cloned in here."""
@@ -83,7 +86,8 @@ class _Batches:
     """The views of each step, all in turn in random order, and what is behind them: a random colour. Of extra views
     there are fewer and fewer in a step."""
 
-    def __init__(self, views: Views, extra_views: Views | None, schedule: Schedule):
+    def __init__(self, views: Views, extra_views: Views | None, schedule: Schedule, choose: Choose | None):
+        self.choose = choose
         count, self.extra, self.size = len(views), extra_views is not None, schedule.batch
         self.views = joined(views, extra_views) if self.extra else views
         self.coarse = downsampled(self.views, reduction(self.views, schedule.coarse_size or max(self.views.size)))
@@ -93,14 +97,19 @@ class _Batches:
 
     def take(self, fraction: float) -> tuple[Views, Tensor]:
         """-> the views, and the background (3,)."""
+        chosen = self.choose(fraction, self.size) if self.choose else None
+        if chosen is None:
+            chosen = self._in_turn(fraction)
+        views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
+        return views, torch.rand(3, generator=self.generator).to(views.rgb)
+
+    def _in_turn(self, fraction: float) -> list[int]:
         count = self.size
         if self.extra:
             first, last = PHOTO_SHARE
             share = first + (last - first) * fraction
             count = int((torch.rand(self.size, generator=self.generator) < share).sum())
-        chosen = self.photographs.take(count) + self.others.take(self.size - count)
-        views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
-        return views, torch.rand(3, generator=self.generator).to(views.rgb)
+        return self.photographs.take(count) + self.others.take(self.size - count)
 
     def probe(self, number: int, fraction: float) -> tuple[Views, Tensor]:
         """Views and background as above, of the `number`-th step of those by which the speed is measured; nothing is
@@ -147,7 +156,8 @@ def optimise(
     schedule: Schedule,
     *,
     extra_views: Views | None = None,
-    after_backward: Callable[[int, float], None] | None = None,
+    choose: Choose | None = None,
+    after_backward: Callable[[int, float], object] | None = None,
     generator: torch.Generator | None = None,
     text: str = "optimising",
     progress: Callable[[float, str], None] | None = None,
@@ -155,12 +165,13 @@ def optimise(
     """Takes steps of Adam as `schedule` says; returns how many.
 
     A step draws `scene()` from a few of the views over a random colour, and descends on `loss(step)`. `extra_views`,
-    where given, make up the rest of a step's share PHOTO_SHARE of `views`. `after_backward(number, fraction)` may
-    change the parameters' rows after a step, while their gradients are still there. `generator` is what `scene` and
+    where given, make up the rest of a step's share PHOTO_SHARE of `views`. `choose(fraction, count)` may say which of
+    the views a step draws (indices), in place of all in turn in random order (None). `after_backward(number, fraction)`
+    may change the parameters' rows after a step, while their gradients are still there. `generator` is what `scene` and
     `loss` take random numbers from, if they do: measuring the speed leaves it as it was. `progress(fraction, text)` is
     called about ten times a second, and with a line that has "planned" in it when steps are planned for seconds.
     Call inside of `gradients()`, with views from `detached`."""
-    batches, report = _Batches(views, extra_views, schedule), _Report(text, progress)
+    batches, report = _Batches(views, extra_views, schedule, choose), _Report(text, progress)
     timed = schedule.steps is None and schedule.seconds > 0
     if timed:
         warm_up(views.rgb.device.type)

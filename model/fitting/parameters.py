@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -29,10 +31,15 @@ class Parameters:
 
     `parameters[name]` is the leaf that gradients reach."""
 
-    def __init__(self, values: dict[str, Tensor], rates: dict[str, tuple[float, float]]):
+    def __init__(
+        self,
+        values: dict[str, Tensor],
+        rates: dict[str, tuple[float, float]],
+        common: Collection[str] = (),
+    ):
         """values: name -> tensor of any shape; rates: name -> learning rate at the start and at the end of the
-        budget."""
-        self.rates = rates
+        budget. common: names of what has no row for each Gaussian: `keep_rows` and `reset_moments` leave it alone."""
+        self.rates, self.common = rates, frozenset(common)
         self.values = {k: v.detach().clone().requires_grad_() for k, v in values.items()}
         self.moments = {k: (torch.zeros_like(v), torch.zeros_like(v)) for k, v in self.values.items()}
         self.steps = 0
@@ -61,7 +68,9 @@ class Parameters:
     def keep_rows(self, keep: Tensor) -> None:
         """Keeps the rows `keep` ((K,) indices, repeats allowed, or a mask (N,)) of every tensor, with their gradients
         and moments."""
-        for k, old in self.values.items():
+        for k, old in list(self.values.items()):
+            if k in self.common:
+                continue
             self.values[k] = old.detach()[keep].clone().requires_grad_()
             self.values[k].grad = None if old.grad is None else old.grad[keep]
             self.moments[k] = tuple(m[keep].clone() for m in self.moments[k])
@@ -69,8 +78,8 @@ class Parameters:
     @torch.no_grad()
     def reset_moments(self, rows: Tensor) -> None:
         """Sets Adam's moments of these rows ((K,) indices or mask (N,)) to 0, as for newly made ones."""
-        for moments in self.moments.values():
-            for m in moments:
+        for name in self.moments.keys() - self.common:
+            for m in self.moments[name]:
                 m[rows] = 0
 
 

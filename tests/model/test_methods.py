@@ -19,8 +19,8 @@ def test_what_methods_are():
     assert all(name == m.name and m.about for name, m in METHODS.items())
     assert named(has_depth=True) == {"tracks", "lift", "guided"}
     assert named(knows_surface=True) == {"lift", "guided", "rgb", "sweep"}
-    assert named(fits=True) == {"tracks", "4dgs", "som"}
-    assert named(baseline=False) == {"lift", "guided", "rgb", "sweep", "tracks"}
+    assert named(fits=True) == {"tracks", "deform", "4dgs", "som"}
+    assert named(baseline=False) == {"lift", "guided", "rgb", "sweep", "deform", "tracks"}
     assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"}
     assert named(checkpoint="sweep") == {"rgb", "sweep"}
     assert all(m.about.startswith("ours") != m.baseline for m in METHODS.values())
@@ -39,7 +39,7 @@ def test_without_baselines_there_are_the_products_methods():
     code = "import timesplat.model.reconstruct as r, sys; from timesplat.model.methods import METHODS; print(*METHODS)"
     code += "; print([m for m in sys.modules if 'baselines' in m])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.splitlines() == ["tracks lift guided rgb sweep predicted", "[]"]
+    assert out.splitlines() == ["tracks lift guided rgb sweep deform predicted", "[]"]
 
 
 @pytest.mark.parametrize(

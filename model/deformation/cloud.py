@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A cloud of Gaussians at rest and the control points that move it, while it is fitted; and the tracks that it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..gaussians import Gaussians4D
+from ..geometry.shared_paths import ride
+from ..io.asset import STATIC_SIGMA_T
+from ..rotations import quaternion_multiply, rotate
+from ..tracks import Tracks4D
+from .motion_table import MotionTable, spread_points
+from .skinning import Skin
+
+CONTROL_POINTS = 800
+NEAREST = 4  # control points by which a Gaussian is moved
+NEIGHBOURS = 6  # control points that a control point should keep its distance from
+SEEN = 0.05  # opacity from which on a Gaussian may have a control point
+
+
+@dataclass
+class ControlPoints:
+    """C points at rest that are moved by a table, and move what is near."""
+
+    rest: Tensor  # (C,3)
+    levels: list[Tensor]  # how much each place of the table's levels moves them, (C,C_l)
+    neighbours: Tensor  # (C,J) rows of the nearest others
+    gap: float  # the median distance between neighbours, by which influence falls off
+
+    @staticmethod
+    def among(points: Tensor, table: MotionTable, generator: torch.Generator) -> ControlPoints:
+        """Some of the points (N,3), 2 or more, that lie far apart."""
+        rest = spread_points(points, CONTROL_POINTS, generator)
+        apart = torch.cdist(rest, rest)
+        nearest = apart.topk(min(NEIGHBOURS + 1, len(rest)), largest=False)
+        gap = float(nearest.values[:, 1:NEAREST].mean(1).median())
+        return ControlPoints(rest, table.weights(rest), nearest.indices[:, 1:], max(gap, 1e-4))
+
+    def influence(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """points (N,3) -> the control points that move each (N,K) int32, and how much (N,K), of sum 1."""
+        parts = [
+            torch.cdist(p, self.rest).topk(min(NEAREST, len(self.rest)), largest=False) for p in points.split(8192)
+        ]
+        distance, near = (torch.cat([p[i] for p in parts]) for i in range(2))
+        weight = torch.exp(-0.5 * (distance / self.gap).square()) + 1e-8
+        return near.int(), weight / weight.sum(1, keepdim=True)
+
+    def bending(self, place: Tensor, turn: Tensor) -> Tensor:
+        """place (C,3), turn (C,4) -> () how far neighbours are from where each would carry them if it were rigid, mean
+        square over the gap's (as-rigid-as-possible, Sorkine and Alexa 2007; SC-GS)."""
+        arm = rotate(turn[:, None], self.rest[self.neighbours] - self.rest[:, None])
+        away = place[self.neighbours] - place[:, None] - arm
+        return away.square().sum(-1).mean() / self.gap**2
+
+
+@dataclass
+class DeformingCloud:
+    """A `DynamicScene` of what is trained: xyz (N,3), scale (N,3) log, rotation (N,4), rgb (N,3) and opacity (N,) logit
+    at rest, and the table's values."""
+
+    values: dict[str, Tensor]
+    table: MotionTable
+    control: ControlPoints
+    near: Tensor  # (N,K) int32
+    weight: Tensor  # (N,K)
+    poses: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)  # of the control points, at times asked for
+
+    def __len__(self) -> int:
+        return len(self.values["xyz"])
+
+    def pose(self, t: float) -> tuple[Tensor, Tensor]:
+        """Place (C,3) and turn (C,4) of the control points at time t."""
+        if t not in self.poses:
+            self.poses[t] = self.table.pose(self.values, self.control.levels, self.control.rest, t)
+        return self.poses[t]
+
+    def at(self, t: float) -> Gaussians4D:
+        """The scene at time t in [-1,1], differentiable."""
+        v, opacity = self.values, self.values["opacity"].sigmoid()
+        rotation = F.normalize(v["rotation"], dim=-1)
+        xyz, rotation = Skin.apply(self.near, self.weight, self.control.rest, *self.pose(t), v["xyz"], rotation)
+        still = torch.zeros_like(opacity)
+        always = torch.full_like(opacity, STATIC_SIGMA_T)
+        return Gaussians4D(xyz, still, torch.zeros_like(xyz), always, v["scale"].exp(), rotation, v["rgb"], opacity)
+
+    @torch.no_grad()
+    def to_tracks(self, frames: int, tolerance: float) -> Tracks4D:
+        """The cloud as tracks of a clip of so many frames, which they are true to within twice the tolerance."""
+        v, control = self.values, self.control
+        one = torch.tensor([1.0, 0, 0, 0]).expand(len(self), 4)
+        moved = [
+            Skin.apply(self.near, self.weight, control.rest, *self.pose(t), v["xyz"], one)
+            for t in torch.linspace(-1, 1, frames).tolist()
+        ]
+        place, turn = (torch.stack([m[i] for m in moved], 1) for i in range(2))
+        window = torch.tensor([0, frames - 1]).expand(len(self), 2)
+        path, offset, rotation, paths = ride(place, turn, window, tolerance)
+        return Tracks4D(
+            offset=offset,
+            scale=v["scale"].exp(),
+            rotation=F.normalize(quaternion_multiply(rotation, F.normalize(v["rotation"], dim=-1)), dim=-1),
+            rgb=v["rgb"].clone(),
+            opacity=v["opacity"].sigmoid(),
+            path=path,
+            paths=paths,
+        )

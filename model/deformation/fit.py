@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The method `deform`: photographs at times in, tracks out. One cloud of Gaussians at rest, whose looks all views
+share, moved by control points (SC-GS, Huang et al. 2024), and both fitted to the photographs, with nothing else known.
+
+Where things move fast, what a view shows is far from where it was in the views that are known, and no gradient leads
+there. So a fit begins in the middle of the clip and goes on to its ends; motion is a table of several levels
+(`motion_table.py`); pictures are small at first; and neighbours are held together less and less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...datagen.sequence import InputError
+from ..fitting.budget import parse_budget
+from ..fitting.densify import Densifier, Pace
+from ..fitting.fit_views import detached
+from ..fitting.loop import Schedule, Step, gradients, optimise, photometric_loss, warm_up
+from ..fitting.parameters import Parameters
+from ..fitting.quality import Quality
+from ..geometry.silhouettes import points_inside
+from ..geometry.surface_tracks import pixel_size
+from ..tracks import Tracks4D
+from ..views import Views
+from .cloud import SEEN, ControlPoints, DeformingCloud
+from .motion_table import MotionTable
+
+LEAST = 8  # Gaussians that a fit begins with, whatever the budget
+TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
+MAX_GAUSSIANS = 8000  # where no other number is asked for; pictures of 128² are worth no more
+
+
+@dataclass(frozen=True)
+class DeformFit:
+    """How a cloud and its motion are fitted; rates of Adam at the start and at the end, those of places in pixels."""
+
+    xyz: tuple[float, float] = (0.5, 0.01)
+    scale: tuple[float, float] = (2e-2, 2e-3)
+    rotation: tuple[float, float] = (1e-2, 1e-3)
+    rgb: tuple[float, float] = (1e-2, 1e-3)
+    opacity: tuple[float, float] = (5e-2, 5e-3)
+    motion: tuple[float, float] = (0.08, 0.0036)  # in steps of a frame in model time: the more frames, the slower
+    start: int = 1000  # Gaussians at the start
+    first_views: int = 8  # nearest to the middle of the clip, which say where these are
+    start_opacity: float = 0.1
+    window: float = 0.4  # share of the schedule after which all of the clip is looked at
+    front: float = 0.5  # of the views until then are of the moments that came in last
+    margin: float = 2.5  # frames about the middle at the start, and of what counts as last
+    bending: tuple[float, float] = (0.02, 0.001)  # weight in the loss, at the start and at the end
+    opacity_weight: tuple[float, float] = (0.005, 5e-5)  # of mean opacity, likewise
+    bind_every: int = 20  # steps after which what is near what is asked anew …
+    place_every: int = 100  # … and after which control points are chosen anew
+
+
+FIT = DeformFit()
+PACE = Pace(every=50, since=0.2, until=0.6, share=None)
+
+
+class _Fit:
+    """The state of a fit, and what its steps ask for."""
+
+    def __init__(self, views: Views, max_gaussians: int, fit: DeformFit, seed: int):
+        self.views, self.fit, self.pixel = views, fit, pixel_size(views)
+        self.generator = torch.Generator().manual_seed(seed)
+        middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
+        xyz, rgb = points_inside(middle, max(min(fit.start, max_gaussians), LEAST), self.generator)
+        self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
+        rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
+        rates["xyz"] = tuple(self.pixel * r for r in fit.xyz)
+        motion = self.table.zeros()
+        rates |= dict.fromkeys(motion, tuple(views.frame_step * r for r in fit.motion))
+        self.parameters = Parameters(self._start(xyz, rgb) | motion, rates, common=motion)
+        self.densifier = Densifier(self.parameters, self.generator, max_gaussians, PACE)
+        self._place()
+        self._bind()
+
+    def _start(self, xyz: Tensor, rgb: Tensor) -> dict[str, Tensor]:
+        n = len(xyz)
+        parts = xyz.split(4096)
+        apart = torch.cat([torch.cdist(p, xyz).topk(min(4, n), largest=False).values[:, 1:].mean(1) for p in parts])
+        return {
+            "xyz": xyz,
+            "scale": apart.clamp(0.3 * self.pixel, 0.1).log()[:, None].expand(-1, 3),
+            "rotation": torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
+            "rgb": rgb,
+            "opacity": torch.full((n,), self.fit.start_opacity).logit(),
+        }
+
+    @torch.no_grad()
+    def _place(self) -> None:
+        p = self.parameters
+        seen = p["opacity"].sigmoid() > SEEN
+        points = p["xyz"].detach()
+        self.control = ControlPoints.among(points[seen] if seen.sum() > 1 else points, self.table, self.generator)
+
+    @torch.no_grad()
+    def _bind(self) -> None:
+        self.near, self.weight = self.control.influence(self.parameters["xyz"].detach())
+
+    def cloud(self) -> DeformingCloud:
+        return DeformingCloud(self.parameters.values, self.table, self.control, self.near, self.weight)
+
+    def choose(self, fraction: float, count: int) -> list[int] | None:
+        """Views of the moments that the fit has come to, half of them of those that came last; later all in turn."""
+        f, views = self.fit, self.views
+        if fraction >= f.window:
+            return None
+        far, margin = views.time.abs(), f.margin * views.frame_step
+        half = max(margin, fraction / f.window)
+        known = (far <= half + 1e-6).nonzero()[:, 0]
+        if not len(known):
+            return None
+        last = known[far[known] > half - margin]
+        chosen = []
+        for _ in range(count):
+            old = float(torch.rand((), generator=self.generator)) > f.front or not len(last)
+            among = known if old else last
+            chosen.append(int(among[torch.randint(len(among), (), generator=self.generator)]))
+        return chosen
+
+    def loss(self, step: Step) -> Tensor:
+        f, cloud = self.fit, step.scene
+        bending = sum(cloud.control.bending(*pose) for pose in cloud.poses.values())
+        opacity = cloud.values["opacity"].sigmoid().mean()
+        a, b = (first * (last / first) ** step.fraction for first, last in (f.opacity_weight, f.bending))
+        return photometric_loss(step) + a * opacity + b * bending
+
+    def after_backward(self, number: int, fraction: float) -> None:
+        if self.densifier.after_backward(number, fraction):
+            self._bind()
+        if number % self.fit.place_every == 0:
+            self._place()
+        if number % self.fit.bind_every == 0:
+            self._bind()
+
+
+def reconstruct_deform(
+    views: Views,
+    seconds: float = 10.0,
+    *,
+    steps: int | None = None,
+    quality: Quality | None = None,
+    budget: str | None = None,
+    seed: int = 0,
+    fit: DeformFit = FIT,
+    progress=None,
+) -> Tracks4D:
+    """Views (RGB and alpha alone are used) -> tracks (N,), after about `seconds`, or exactly `steps`, or those of
+    `quality`, and no more than these or the budget say. budget: "N", or "P%" of MAX_GAUSSIANS. For `progress` see
+    `optimise`. Raises InputError for the budget "auto"."""
+    if quality:
+        steps = quality.steps
+    most = quality.gaussians if quality else MAX_GAUSSIANS
+    if budget:
+        wanted = parse_budget(budget)
+        if wanted is None:
+            raise InputError("deform: its budget cannot be found by itself; give a number of Gaussians.")
+        most = min(most, max(round(wanted * MAX_GAUSSIANS) if isinstance(wanted, float) else wanted, 1))
+    with gradients():
+        views = detached(views)
+        warm_up("cpu")
+        state = _Fit(views, most, fit, seed)
+        schedule = Schedule(seconds=seconds, steps=steps, coarse_size=max(views.size) // 2, seed=seed)
+        optimise(
+            state.parameters,
+            state.cloud,
+            views,
+            state.loss,
+            schedule,
+            choose=state.choose,
+            after_backward=state.after_backward,
+            generator=state.generator,
+            text="fitting motion and looks",
+            progress=progress,
+        )
+        state._bind()
+        frames = round(2 / views.frame_step) + 1
+        tracks = state.cloud().to_tracks(frames, TOLERANCE * state.pixel)
+        return tracks if len(tracks) <= most else tracks[tracks.opacity.topk(most).indices]

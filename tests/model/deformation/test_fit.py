@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The fit from pictures alone, of a small scene that moves: two blobs, of which one goes its way."""
+
+import numpy as np
+import pytest
+import torch
+
+from timesplat.datagen.rigs import spherical
+from timesplat.datagen.sequence import InputError, opengl_to_opencv
+from timesplat.model.deformation.fit import reconstruct_deform
+from timesplat.model.fitting.quality import Quality
+from timesplat.model.gaussians import Gaussians4D
+from timesplat.model.rasterize import render
+from timesplat.model.views import Views
+
+FRAMES, SIZE = 8, 32
+
+
+def blobs() -> Gaussians4D:
+    return Gaussians4D(
+        xyz=torch.tensor([[-0.3, 0, 0], [0.3, 0, 0]]),
+        t=torch.zeros(2),
+        velocity=torch.tensor([[0, 0, 0], [0, 0, 0.4]]),
+        sigma_t=torch.full((2,), 1e4),
+        scale=torch.full((2, 3), 0.12),
+        rotation=torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4),
+        rgb=torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.2, 0.9]]),
+        opacity=torch.full((2,), 0.98),
+    )
+
+
+def seen(offset: float) -> Views:
+    """Three views a frame, from around; `offset` degrees further."""
+    poses = [spherical(offset + 137.5 * i, 50 * ((i * 0.618) % 1 - 0.5), 2.7) for i in range(3 * FRAMES)]
+    c2w = torch.from_numpy(opengl_to_opencv(np.stack(poses))).float()
+    intrinsics = torch.tensor([[SIZE, SIZE, SIZE / 2, SIZE / 2]]).expand(len(poses), 4).float()
+    time = torch.linspace(-1, 1, FRAMES).repeat_interleave(3)
+    rgb, alpha = render(blobs(), c2w, intrinsics, time, SIZE, SIZE, background=0.0)
+    return Views(rgb / alpha[..., None].clamp_min(1e-6), alpha, c2w, intrinsics, time, 2 / (FRAMES - 1))
+
+
+def psnr(scene, views: Views) -> float:
+    rgb, _ = render(scene, views.c2w, views.intrinsics, views.time, SIZE, SIZE)
+    return float(-10 * (rgb - views.over(1.0)).square().mean().log10())
+
+
+def test_it_finds_looks_and_motion():
+    tracks = reconstruct_deform(seen(0), steps=300, budget="300")
+    assert len(tracks) <= 300
+    assert psnr(tracks, seen(60)) > 26
+    still = psnr(tracks.at(0.0), seen(60))
+    assert psnr(tracks, seen(60)) > still + 3, "it must be the motion that makes it right"
+
+
+def test_same_seed_same_tracks_and_a_quality_says_how_many():
+    few = Quality(size=32, steps=20, gaussians=200)
+    a, b, c = (reconstruct_deform(seen(0), quality=few, seed=seed) for seed in (3, 3, 4))
+    assert torch.equal(a.offset, b.offset) and torch.equal(a.rgb, b.rgb) and len(a) <= 200
+    assert len(a) != len(c) or not torch.equal(a.rgb, c.rgb)
+
+
+def test_a_budget_of_one_and_one_that_cannot_be_found():
+    assert len(reconstruct_deform(seen(0), steps=2, budget="1")) == 1
+    with pytest.raises(InputError, match="give a number"):
+        reconstruct_deform(seen(0), steps=1, budget="auto")

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The table of motion: at rest nothing moves, what all places do everything does, and levels add up."""
+
+import torch
+
+from timesplat.model.deformation.motion_table import MotionTable, spread_points
+
+
+def a_table(count=700):
+    g = torch.Generator().manual_seed(0)
+    points = torch.rand(count, 3, generator=g)
+    return MotionTable.around(points, 10, g), points
+
+
+def test_at_rest_nothing_moves():
+    table, points = a_table()
+    place, turn = table.pose(table.zeros(), table.weights(points), points, 0.3)
+    assert torch.equal(place, points) and torch.equal(turn, torch.tensor([1.0, 0, 0, 0]).expand(700, 4))
+
+
+def test_levels_add_up():
+    table, points = a_table()
+    values = table.zeros()
+    assert len(values) == 5
+    for v in values.values():
+        v[..., 0], v[..., 5] = 0.1, 0.02
+    place, turn = table.pose(values, table.weights(points), points, -0.4)
+    assert torch.allclose(place, points + torch.tensor([0.5, 0, 0]), atol=1e-6)
+    assert torch.allclose(2 * torch.atan2(turn[:, 3], turn[:, 0]), torch.tensor(0.1), atol=1e-4)
+
+
+def test_what_a_place_does_is_done_near_it_then():
+    table, points = a_table()
+    values = table.zeros()
+    values["motion4"][2, 7, 1] = 1.0
+    there = table.places[4][7:8]
+    weights = table.weights(there)
+    then, later = (table.pose(values, weights, there, t)[0] - there for t in (float(table.moments[2]), 1.0))
+    assert then[0, 1] > 10 * later[0, 1].abs() and then[0, 0] == 0
+    far = points[(points - there).norm(dim=-1).argmax()][None]
+    assert (table.pose(values, table.weights(far), far, float(table.moments[2]))[0] - far).abs().max() < 1e-3
+
+
+def test_spread_points_lie_apart():
+    _, points = a_table()
+    g = torch.Generator().manual_seed(1)
+    chosen = spread_points(points, 20, g)
+    random = points[:20]
+    nearest = [float((torch.cdist(p, p) + 9 * torch.eye(20)).min()) for p in (chosen, random)]
+    assert nearest[0] > 2 * nearest[1]
+    assert len(spread_points(points[:5], 20, g)) == 5
