@@ -15,7 +15,8 @@ from .helpers import REAL, ROOT, TARGET, make
 ALLOWED = [
     *("__init__.py", "LICENSE", "README.md", "blender_manifest.toml"),
     *("addon/*.py", "addon/*/*.py", "datagen/*.py", "datagen/*/*.py", "model/*.py"),
-    *("model/fitting/*.py", "model/geometry/*.py", "model/io/*.py", "model/rasterize/*.py", "model/rasterize/*/*.py"),
+    *("model/deformation/*.py", "model/fitting/*.py", "model/geometry/*.py", "model/io/*.py"),
+    *("model/rasterize/*.py", "model/rasterize/*/*.py"),
     *("model/checkpoints/*.safetensors", "model/checkpoints/*.md"),
 ]
 NEEDED = {
