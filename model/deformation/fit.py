@@ -129,11 +129,10 @@ class _Fit:
         return photometric_loss(step) + a * opacity + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
-        if self.densifier.after_backward(number, fraction):
-            self._bind()
+        densified = self.densifier.after_backward(number, fraction)
         if number % self.fit.place_every == 0:
             self._place()
-        if number % self.fit.bind_every == 0:
+        if densified or number % self.fit.bind_every == 0:
             self._bind()
 
 
@@ -145,7 +144,6 @@ def reconstruct_deform(
     quality: Quality | None = None,
     budget: str | None = None,
     seed: int = 0,
-    fit: DeformFit = FIT,
     progress=None,
 ) -> Tracks4D:
     """Views (RGB and alpha alone are used) -> tracks (N,), after about `seconds`, or exactly `steps`, or those of
@@ -162,7 +160,7 @@ def reconstruct_deform(
     with gradients():
         views = detached(views)
         warm_up("cpu")
-        state = _Fit(views, most, fit, seed)
+        state = _Fit(views, most, FIT, seed)
         schedule = Schedule(seconds=seconds, steps=steps, coarse_size=max(views.size) // 2, seed=seed)
         optimise(
             state.parameters,
