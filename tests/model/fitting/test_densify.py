@@ -4,7 +4,7 @@
 import pytest
 import torch
 
-from timesplat.model.fitting.densify import EVERY, FAINT, SHARE, Densifier, densify
+from timesplat.model.fitting.densify import EVERY, FAINT, SHARE, Densifier, Pace, densify
 from timesplat.model.fitting.parameters import RATES, Parameters, activate
 
 
@@ -43,3 +43,16 @@ def test_the_limit_is_kept_and_gradients_add_up_in_between(parameters):
             torch.testing.assert_close(densifier.grad_accum, torch.full((100,), 3**0.5))
         p["xyz"].grad = None
     assert densifier.grad_accum.tolist() == [0.0] * 101
+
+
+def test_an_even_pace_leads_to_the_most_by_its_end(parameters):
+    p, pace = parameters, Pace(every=10, since=0.2, until=0.6, share=None)
+    densifier = Densifier(p, torch.Generator().manual_seed(0), 400, pace)
+    counts = []
+    for step in range(1, 201):
+        p["xyz"].sum().backward()
+        changed = densifier.after_backward(step, step / 200)
+        assert changed == (step % 10 == 0 and 0.2 <= step / 200 < 0.6)
+        counts.append(len(p["xyz"]))
+        p["xyz"].grad = None
+    assert counts[38] == 100 and 100 < counts[70] < 400 and counts[-1] == 400

@@ -46,3 +46,13 @@ def test_raw_parameters_activate_to_the_same_gaussians(spheres):
         torch.testing.assert_close(getattr(back, k), expected, atol=1e-5, rtol=1e-4)
     longer = activate(raw_parameters(g, min_sigma_t=0.5, fade=0.3))
     assert longer.sigma_t.min() > 0.499 and longer.opacity.max() < 0.31
+
+
+def test_what_is_common_keeps_its_rows_and_moments():
+    p = Parameters({"a": torch.zeros(4), "all": torch.ones(2, 3)}, {"a": (1.0, 1.0), "all": (1.0, 1.0)}, common=["all"])
+    (p["a"].sum() + p["all"].sum()).backward()
+    p.step(0.0)
+    p.keep_rows(torch.tensor([3, 3, 1, 0, 2]))
+    p.reset_moments(torch.tensor([4]))
+    assert len(p["a"]) == 5 and p["all"].shape == (2, 3)
+    assert p.moments["a"][0][4] == 0 and (p.moments["all"][0] > 0).all()
