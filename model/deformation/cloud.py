@@ -12,9 +12,10 @@ from torch import Tensor
 from ..gaussians import Gaussians4D
 from ..geometry.shared_paths import ride
 from ..io.asset import STATIC_SIGMA_T
-from ..rotations import quaternion_multiply, rotate
+from ..rotations import quaternion_multiply
 from ..tracks import Tracks4D
 from .motion_table import MotionTable, spread_points
+from .posing import Bending
 from .skinning import Skin
 
 CONTROL_POINTS = 800
@@ -28,7 +29,7 @@ class ControlPoints:
     """C points at rest that are moved by a table, and move what is near."""
 
     rest: Tensor  # (C,3)
-    levels: list[Tensor]  # how much each place of the table's levels moves them, (C,C_l)
+    weights: tuple[Tensor, Tensor]  # the table's places that move them (C,S) int32, and how much
     neighbours: Tensor  # (C,J) rows of the nearest others
     gap: float  # the median distance between neighbours, by which influence falls off
 
@@ -53,9 +54,7 @@ class ControlPoints:
     def bending(self, place: Tensor, turn: Tensor) -> Tensor:
         """place (C,3), turn (C,4) -> () how far neighbours are from where each would carry them if it were rigid, mean
         square over the gap's (as-rigid-as-possible, Sorkine and Alexa 2007; SC-GS)."""
-        arm = rotate(turn[:, None], self.rest[self.neighbours] - self.rest[:, None])
-        away = place[self.neighbours] - place[:, None] - arm
-        return away.square().sum(-1).mean() / self.gap**2
+        return Bending.apply(self.neighbours, self.rest, place, turn) / self.gap**2
 
 
 @dataclass
@@ -76,7 +75,7 @@ class DeformingCloud:
     def pose(self, t: float) -> tuple[Tensor, Tensor]:
         """Place (C,3) and turn (C,4) of the control points at time t."""
         if t not in self.poses:
-            self.poses[t] = self.table.pose(self.values, self.control.levels, self.control.rest, t)
+            self.poses[t] = self.table.pose(self.values["motion"], self.control.weights, self.control.rest, t)
         return self.poses[t]
 
     def at(self, t: float) -> Gaussians4D:

@@ -49,6 +49,7 @@ class DeformFit:
     window: float = 0.4  # share of the schedule after which all of the clip is looked at
     front: float = 0.5  # of the views until then are of the moments that came in last
     margin: float = 2.5  # frames about the middle at the start, and of what counts as last
+    ssim_weight: float = 0.2
     bending: tuple[float, float] = (0.02, 0.001)  # weight in the loss, at the start and at the end
     opacity_weight: tuple[float, float] = (0.005, 5e-5)  # of mean opacity, likewise
     bind_every: int = 20  # steps after which what is near what is asked anew …
@@ -70,9 +71,9 @@ class _Fit:
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
         rates["xyz"] = tuple(self.pixel * r for r in fit.xyz)
-        motion = self.table.zeros()
-        rates |= dict.fromkeys(motion, tuple(views.frame_step * r for r in fit.motion))
-        self.parameters = Parameters(self._start(xyz, rgb) | motion, rates, common=motion)
+        rates["motion"] = tuple(views.frame_step * r for r in fit.motion)
+        values = self._start(xyz, rgb) | {"motion": self.table.zeros()}
+        self.parameters = Parameters(values, rates, common=["motion"])
         self.densifier = Densifier(self.parameters, self.generator, max_gaussians, PACE)
         self._place()
         self._bind()
@@ -126,7 +127,7 @@ class _Fit:
         bending = sum(cloud.control.bending(*pose) for pose in cloud.poses.values())
         opacity = cloud.values["opacity"].sigmoid().mean()
         a, b = (first * (last / first) ** step.fraction for first, last in (f.opacity_weight, f.bending))
-        return photometric_loss(step) + a * opacity + b * bending
+        return photometric_loss(step, f.ssim_weight) + a * opacity + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
         densified = self.densifier.after_backward(number, fraction)

@@ -11,11 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+
+from .posing import Pose
 
 LEVELS = (1, 12, 48, 192, 600)  # places of each
 MOMENTS = 64  # at the most
+NEAREST = 8  # places of a level that move a point
 WIDTH = 1.5  # σ of a moment's influence, in moments: of 1 and of 2 some objects came out worse
 
 
@@ -34,39 +36,40 @@ def spread_points(points: Tensor, count: int, generator: torch.Generator, among:
 
 @dataclass
 class MotionTable:
-    """Where the values are, which are trained: `values` (M,C_l,6) of each level, how far a place goes, and
-    the axis about which it turns times (for small ones) the angle, 0 at first; smoothed over neighbouring moments."""
+    """Where the values are, which are trained: (M,P,6), how far a place goes, and the axis about which it turns times
+    (for small ones) the angle, 0 at first; smoothed over neighbouring moments."""
 
-    places: list[Tensor]  # (C_l,3) of each level, at rest
+    levels: list[Tensor]  # (P_l,3) places of each, at rest; P in all
     reach: list[float]  # σ of a place's influence, of each level
     moments: Tensor  # (M,) model times, evenly from -1 to 1
 
     @staticmethod
     def around(points: Tensor, frames: int, generator: torch.Generator) -> MotionTable:
         """For an object of which points (N,3) are known, 1 or more, in a clip of so many frames."""
-        places = [spread_points(points, n, generator) for n in LEVELS if n <= len(points)]
-        reach = [2.0] + [float(torch.cdist(p, p).topk(2, largest=False).values[:, 1].median()) for p in places[1:]]
+        levels = [spread_points(points, n, generator) for n in LEVELS if n <= len(points)]
+        reach = [2.0] + [float(torch.cdist(p, p).topk(2, largest=False).values[:, 1].median()) for p in levels[1:]]
         count = min(max(frames, 2), MOMENTS)
-        return MotionTable(places, [max(r, 1e-3) for r in reach], torch.linspace(-1, 1, count))
+        return MotionTable(levels, [max(r, 1e-3) for r in reach], torch.linspace(-1, 1, count))
 
-    def zeros(self) -> dict[str, Tensor]:
-        """The values at rest, by the names under which they are trained."""
-        return {f"motion{i}": torch.zeros(len(self.moments), len(p), 6) for i, p in enumerate(self.places)}
+    def zeros(self) -> Tensor:
+        """The values at rest."""
+        return torch.zeros(len(self.moments), sum(map(len, self.levels)), 6)
 
-    def weights(self, points: Tensor) -> list[Tensor]:
-        """points (C,3) -> of each level how much each of its places moves them, (C,C_l) of sum 1."""
-        found = []
-        for places, reach in zip(self.places, self.reach, strict=True):
-            d = (torch.cdist(points, places) / reach).square()
-            w = torch.exp(0.5 * (d.amin(1, keepdim=True) - d))
-            found.append(w / w.sum(1, keepdim=True))
-        return found
+    def weights(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """points (C,3) -> the places that move each (C,S) int32, the NEAREST of each level, and how much (C,S): of a
+        level in all 1."""
+        first, index, weight = 0, [], []
+        for places, reach in zip(self.levels, self.reach, strict=True):
+            d = torch.cdist(points, places).topk(min(NEAREST, len(places)), largest=False)
+            w = torch.exp(0.5 * (d.values[:, :1].square() - d.values.square()) / reach**2)
+            index.append(first + d.indices)
+            weight.append(w / w.sum(1, keepdim=True))
+            first += len(places)
+        return torch.cat(index, 1).int(), torch.cat(weight, 1)
 
-    def pose(self, values: dict[str, Tensor], weights: list[Tensor], points: Tensor, t: float) -> tuple[Tensor, Tensor]:
+    def pose(self, values: Tensor, weights: tuple[Tensor, Tensor], points: Tensor, t: float) -> tuple[Tensor, Tensor]:
         """Where points (C,3) with these weights are at time t (C,3), and their unit quaternions (C,4)."""
         apart = 2 / (len(self.moments) - 1)
-        near = torch.exp(-0.5 * ((t - self.moments) / (WIDTH * apart)).square())
-        near = near / near.sum()
-        gone = sum(w @ torch.tensordot(near, values[f"motion{i}"], 1) for i, w in enumerate(weights))
-        one = torch.ones_like(gone[:, :1])
-        return points + gone[:, :3], F.normalize(torch.cat([one, 0.5 * gone[:, 3:]], -1), dim=-1)
+        share = torch.exp(-0.5 * ((t - self.moments) / (WIDTH * apart)).square())
+        now = (share > 1e-3 * share.max()).nonzero()[:, 0]
+        return Pose.apply(now.int(), share[now] / share[now].sum(), *weights, points, values)

@@ -20,9 +20,9 @@ from ..rasterize import render
 from ..views import Views
 from .fit_views import downsampled, joined, reduction
 from .parameters import Parameters
+from .photometric import photometric_error
 from .plan import PROBE_SHARE, Costs, Plan, TimedPlan
 
-ALPHA_WEIGHT = 0.3  # of the error in alpha against that in colour
 COARSE, COARSE_UNTIL = 160, 0.6  # longest side in pixels of what is drawn in this first part of the schedule
 PROBES = 5  # steps at the most, of each size of pictures, by which the speed is measured
 PHOTO_SHARE = (0.2, 0.8)  # share of a step's views that are photographs, at the start and the end, beside extra views
@@ -62,10 +62,9 @@ def gradients():
         yield
 
 
-def photometric_loss(step: Step) -> Tensor:
-    """() mean absolute error of colours and, at ALPHA_WEIGHT, of alpha."""
-    error = (step.rgb - step.views.over(step.background)).abs().mean()
-    return error + ALPHA_WEIGHT * (step.alpha - step.views.alpha).abs().mean()
+def photometric_loss(step: Step, ssim_weight: float = 0.0) -> Tensor:
+    """() how far a step's pictures are from its views; see `photometric_error`."""
+    return photometric_error(step.rgb, step.alpha, step.views, step.background, ssim_weight)
 
 
 class _Turns:

@@ -21,9 +21,8 @@ def test_at_rest_nothing_moves():
 def test_levels_add_up():
     table, points = a_table()
     values = table.zeros()
-    assert len(values) == 5
-    for v in values.values():
-        v[..., 0], v[..., 5] = 0.1, 0.02
+    assert len(table.levels) == 5
+    values[..., 0], values[..., 5] = 0.1, 0.02
     place, turn = table.pose(values, table.weights(points), points, -0.4)
     assert torch.allclose(place, points + torch.tensor([0.5, 0, 0]), atol=1e-6)
     assert torch.allclose(2 * torch.atan2(turn[:, 3], turn[:, 0]), torch.tensor(0.1), atol=1e-4)
@@ -32,8 +31,9 @@ def test_levels_add_up():
 def test_what_a_place_does_is_done_near_it_then():
     table, points = a_table()
     values = table.zeros()
-    values["motion4"][2, 7, 1] = 1.0
-    there = table.places[4][7:8]
+    place = sum(map(len, table.levels[:4])) + 7
+    values[2, place, 1] = 1.0
+    there = table.levels[4][7:8]
     weights = table.weights(there)
     then, later = (table.pose(values, weights, there, t)[0] - there for t in (float(table.moments[2]), 1.0))
     assert then[0, 1] > 10 * later[0, 1].abs() and then[0, 0] == 0
