@@ -69,6 +69,11 @@ class DeformingCloud:
     weight: Tensor  # (N,K)
     poses: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)  # of the control points, at times asked for
 
+    def __post_init__(self):
+        v = self.values
+        self.scale, self.rotation = v["scale"].exp(), F.normalize(v["rotation"], dim=-1)
+        self.opacity = v["opacity"].sigmoid()
+
     def __len__(self) -> int:
         return len(self.values["xyz"])
 
@@ -80,12 +85,11 @@ class DeformingCloud:
 
     def at(self, t: float) -> Gaussians4D:
         """The scene at time t in [-1,1], differentiable."""
-        v, opacity = self.values, self.values["opacity"].sigmoid()
-        rotation = F.normalize(v["rotation"], dim=-1)
-        xyz, rotation = Skin.apply(self.near, self.weight, self.control.rest, *self.pose(t), v["xyz"], rotation)
-        still = torch.zeros_like(opacity)
-        always = torch.full_like(opacity, STATIC_SIGMA_T)
-        return Gaussians4D(xyz, still, torch.zeros_like(xyz), always, v["scale"].exp(), rotation, v["rgb"], opacity)
+        v, held = self.values, (self.near, self.weight, self.control.rest)
+        xyz, rotation = Skin.apply(*held, *self.pose(t), v["xyz"], self.rotation)
+        still, always = torch.zeros_like(self.opacity), torch.full_like(self.opacity, STATIC_SIGMA_T)
+        velocity = torch.zeros_like(xyz)
+        return Gaussians4D(xyz, still, velocity, always, self.scale, rotation, v["rgb"], self.opacity)
 
     @torch.no_grad()
     def to_tracks(self, frames: int, tolerance: float) -> Tracks4D:
@@ -101,10 +105,10 @@ class DeformingCloud:
         path, offset, rotation, paths = ride(place, turn, window, tolerance)
         return Tracks4D(
             offset=offset,
-            scale=v["scale"].exp(),
-            rotation=F.normalize(quaternion_multiply(rotation, F.normalize(v["rotation"], dim=-1)), dim=-1),
+            scale=self.scale.clone(),
+            rotation=F.normalize(quaternion_multiply(rotation, self.rotation), dim=-1),
             rgb=v["rgb"].clone(),
-            opacity=v["opacity"].sigmoid(),
+            opacity=self.opacity.clone(),
             path=path,
             paths=paths,
         )

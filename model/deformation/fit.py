@@ -125,9 +125,8 @@ class _Fit:
     def loss(self, step: Step) -> Tensor:
         f, cloud = self.fit, step.scene
         bending = sum(cloud.control.bending(*pose) for pose in cloud.poses.values())
-        opacity = cloud.values["opacity"].sigmoid().mean()
         a, b = (first * (last / first) ** step.fraction for first, last in (f.opacity_weight, f.bending))
-        return photometric_loss(step, f.ssim_weight) + a * opacity + b * bending
+        return photometric_loss(step, f.ssim_weight) + a * cloud.opacity.mean() + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
         densified = self.densifier.after_backward(number, fraction)

@@ -5,13 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+import numba
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ..gaussians import Gaussians4D
+from ..parallel import chunks, parallel_for
 
 BETAS, EPSILON = (0.9, 0.99), 1e-10  # Adam's; a shorter memory than usual, for hundreds of steps
+CHUNK = 1 << 16  # entries that a thread takes at once
 # Learning rates of Gaussians that are free to go anywhere, at the start and at the end of a fit.
 RATES = {
     "xyz": (4e-3, 4e-4),
@@ -57,11 +61,16 @@ class Parameters:
             first, last = self.rates[k]
             if v.grad is None or first == 0:
                 continue
-            g, (m, s) = v.grad.nan_to_num_(0, 0, 0), self.moments[k]
-            m.lerp_(g, 1 - a)
-            s.mul_(b).addcmul_(g, g, value=1 - b)
-            scale = first * (last / first) ** fraction / (1 - a**self.steps)
-            v.addcdiv_(m, (s / (1 - b**self.steps)).sqrt_().add_(EPSILON), value=-scale)
+            (m, s), rate = self.moments[k], first * (last / first) ** fraction / (1 - a**self.steps)
+            if v.device.type == "cpu" and v.dtype == torch.float32 and v.is_contiguous():
+                flat = [x.detach().reshape(-1).numpy() for x in (v, v.grad, m, s)]  # of a gradient it may be a copy
+                jobs = chunks(v.numel(), CHUNK)
+                parallel_for(jobs, lambda i, j, x=flat, r=rate: _adam(i, j, *x, r, 1 - b**self.steps))
+            else:
+                g = v.grad.nan_to_num_(0, 0, 0)
+                m.lerp_(g, 1 - a)
+                s.mul_(b).addcmul_(g, g, value=1 - b)
+                v.addcdiv_(m, (s / (1 - b**self.steps)).sqrt_().add_(EPSILON), value=-rate)
             v.grad = None
 
     @torch.no_grad()
@@ -81,6 +90,19 @@ class Parameters:
         for name in self.moments.keys() - self.common:
             for m in self.moments[name]:
                 m[rows] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _adam(begin, end, value, gradient, mean, square, rate, bias):
+    """Adam's step of the entries begin..end of flat arrays, in one pass over them."""
+    a, b = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
+    rate, bias, least = np.float32(rate), np.float32(1 / bias), np.float32(EPSILON)
+    for i in range(begin, end):
+        g = gradient[i]
+        g = g if np.isfinite(g) else np.float32(0)
+        mean[i] += a * (g - mean[i])
+        square[i] += b * (g * g - square[i])
+        value[i] -= rate * mean[i] / (np.sqrt(square[i] * bias) + least)
 
 
 def activate(raw: dict[str, Tensor]) -> Gaussians4D:

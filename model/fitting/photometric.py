@@ -59,13 +59,20 @@ class _Photometric(torch.autograd.Function):
         bands = [(b, y, min(y + 32, height)) for b in range(count) for y in range(0, height, 32)]
         weight = np.float32(1 - ssim_weight)
         sums = parallel_for(bands, lambda b, y, e: _absolute(b, y, e, *arrays, weight, g_rgb, g_alpha, target))
-        value = sum(sums)
+        value = sum(total for total, *_ in sums)
         if ssim_weight:
-            planes = [(b, c) for b in range(count) for c in range(3)]
-            scale = np.float32(ssim_weight / rgb.numel())
-            alike = parallel_for(planes, lambda b, c: _similarity(arrays[0][b, :, :, c], target[b, :, :, c], scale,
-                                                                  g_rgb[b, :, :, c]))  # fmt: skip
-            value += ssim_weight * (1 - sum(alike) / rgb.numel())
+            scale, around = np.float32(ssim_weight / rgb.numel()), 2 * RADIUS
+
+            def similarity(b, c):
+                # Further from what is shown than a window's width both are background: SSIM is 1 there, its gradient 0.
+                there = [s for s, (of, *_) in zip(sums, bands, strict=True) if of == b]
+                rows = slice(max(min(s[1] for s in there) - around, 0), max(s[2] for s in there) + around + 1)
+                columns = slice(max(min(s[3] for s in there) - around, 0), max(s[4] for s in there) + around + 1)
+                x, y, g = (v[b, rows, columns, c] for v in (arrays[0], target, g_rgb))
+                return (x.size - _similarity(x, y, scale, g)) if x.size else 0.0
+
+            unlike = parallel_for([(b, c) for b in range(count) for c in range(3)], similarity)
+            value += float(scale) * sum(unlike)
         ctx.gradients = torch.from_numpy(g_rgb), torch.from_numpy(g_alpha)
         return rgb.new_tensor(value)
 
@@ -77,12 +84,15 @@ class _Photometric(torch.autograd.Function):
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _absolute(b, first, end, rgb, alpha, true_rgb, true_alpha, background, weight, g_rgb, g_alpha, target):
-    """Rows first..end of picture b: -> the part of the error; writes gradients, and the picture to be matched."""
+    """Rows first..end of picture b: -> the part of the error, and the first and last row and column where either
+    picture shows something; writes gradients, and the picture to be matched."""
     colour, cover = weight / np.float32(rgb.size), np.float32(ALPHA_WEIGHT / alpha.size)
-    total = 0.0
+    total, top, bottom, left, right = 0.0, rgb.shape[1], -1, rgb.shape[2], -1
     for y in range(first, end):
         for x in range(rgb.shape[2]):
             a = true_alpha[b, y, x]
+            if a > 0 or alpha[b, y, x] > 0:
+                top, bottom, left, right = min(top, y), max(bottom, y), min(left, x), max(right, x)
             for c in range(3):
                 t = true_rgb[b, y, x, c] * a + background[c] * (1 - a)
                 target[b, y, x, c] = t
@@ -92,7 +102,7 @@ def _absolute(b, first, end, rgb, alpha, true_rgb, true_alpha, background, weigh
             e = alpha[b, y, x] - a
             total += cover * abs(e)
             g_alpha[b, y, x] = cover if e > 0 else -cover if e < 0 else np.float32(0)
-    return total
+    return total, top, bottom, left, right
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -110,9 +120,10 @@ def _blur(source, down, out):
         row, into = down[y], out[y]
         into[:] = 0
         for k in range(-RADIUS, RADIUS + 1):
-            w = WINDOW[k + RADIUS]
-            for x in range(max(0, -k), min(width, width - k)):
-                into[x] += w * row[x + k]
+            w, first, count = WINDOW[k + RADIUS], max(0, -k), max(width - abs(k), 0)
+            to, of = into[first : first + count], row[first + k : first + k + count]
+            for x in range(count):  # no index that could be below 0: so it is done by vectors
+                to[x] += w * of[x]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)

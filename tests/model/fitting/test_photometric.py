@@ -42,3 +42,23 @@ def test_the_same_pictures_have_no_error():
     rgb, _, views, background = pictures(20, 20)
     assert photometric_error(views.over(background), views.alpha.clone(), views, background, 0.2) < 1e-6
     assert photometric_error(rgb, views.alpha.clone(), views, background, 0.2) > 0.1
+
+
+def test_what_is_far_from_the_object_need_not_be_looked_at():
+    """An object in a corner of an empty picture, and one that is drawn a little beside it: exact all the same."""
+    rgb, alpha, views, background = pictures(70, 90)
+    shown, drawn = torch.zeros(2, *alpha.shape)
+    shown[:, 20:31, 30:50], drawn[:, 24:36, 27:44] = 1, 1
+    views.alpha, alpha = views.alpha * shown, alpha * drawn
+    rgb = rgb * alpha[..., None] + background * (1 - alpha[..., None])
+    found = []
+    for function, dtype in ((photometric_error, torch.float32), (_by_torch, torch.float64)):
+        x = rgb.to(dtype, copy=True).requires_grad_()
+        truth = Views(*(getattr(views, k).to(dtype) for k in ("rgb", "alpha", "c2w", "intrinsics", "time")), 1.0)
+        value = function(x, alpha.to(dtype), truth, background.to(dtype), 0.2)
+        value.backward()
+        found.append((value.detach(), x.grad * drawn[..., None]))  # elsewhere only rounding says which way is up
+    for a, b in zip(*found, strict=True):
+        assert (a - b).abs().max() < 5e-5 * b.abs().max()
+    empty = Views(views.rgb, 0 * views.alpha, views.c2w, views.intrinsics, views.time, 1.0)
+    assert photometric_error(background.expand(rgb.shape), 0 * alpha, empty, background, 0.2) == 0
