@@ -12,15 +12,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from . import __version__
 from .datagen.sequence import InputError
 from .exit_codes import NOBODY_READS, exit_code
 
+if TYPE_CHECKING:
+    from .model.io.asset import LoadedAsset
+
 EPILOG = """the road, step by step:
   timesplat render fox.glb --out data/fox --rig alternating     24 posed images with depth and motion
   timesplat reconstruct data/fox/fox/Run --out fox.ply           one 4D Gaussian asset
   timesplat export fox.ply fox.usdc                              for USD pipelines
+  timesplat view fox.ply                                         in the browser
 all of it at once, with pictures and figures:
   timesplat demo fox.glb
 """
@@ -202,7 +207,12 @@ def _bar() -> Iterator[Callable[[float, str], None]]:
 def export_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote, or another "
                    "file of Gaussians: 3DGS .ply, .splat, .spz, USD; or a folder with a .ply a frame")  # fmt: skip
-    p.add_argument("out", type=Path, nargs="?", help=".usdc, .usda, .usdz, .ply, .blend to write; .splat with --frame")
+    p.add_argument(
+        "out",
+        type=Path,
+        nargs="?",
+        help=".usdc, .usda, .usdz, .ply, .html (a page that plays it), .blend to write; .splat with --frame",
+    )
     p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
                    "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
     p.add_argument("--half", action="store_true", help="USD: half precision")
@@ -216,10 +226,11 @@ def export_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def export(args: argparse.Namespace) -> int:
-    """Export an asset: USD (Gaussian splats that older readers take as points), 3DGS .ply slices, or a .blend."""
+    """Export an asset: USD (Gaussian splats that older readers take as points), a web page that plays it, 3DGS .ply
+    slices, or a .blend."""
     import tempfile
 
-    from .model.io.files import WRITABLE, read_asset, write_asset
+    from .model.io.files import WRITABLE, write_asset
     from .model.io.slices import write_slices
     from .model.io.usd_check import check_usd
     from .model.io.usd_stage import USD_SUFFIXES
@@ -234,12 +245,8 @@ def export(args: argparse.Namespace) -> int:
         raise InputError("export: --frame is for one .ply or .splat; drop it.")
     if args.pieces and (args.sequence or args.frame is not None):
         raise InputError("export: --pieces is for what has time, not for moments; drop it.")
-    loaded = read_asset(args.asset)
+    loaded = _read(args.asset)
     asset, count = loaded.asset, len(loaded.asset)
-    if loaded.note:
-        print(f"{args.asset}: {loaded.note}")
-    if loaded.up != "Z":
-        print(f"{args.asset}: {loaded.up} is up in it, as far as is known; nothing is turned, Z is taken for up")
     if loaded.motion is not None and not usd:
         print(f"{args.asset}: it moves as a whole; what is written stands where that starts, USD would keep it")
     if args.sequence:
@@ -251,7 +258,7 @@ def export(args: argparse.Namespace) -> int:
             count = write_asset(ply, asset, pieces=args.pieces)
             save_blend(ply, args.out)
     elif suffix not in WRITABLE and args.frame is None:
-        raise InputError(f"{args.out}: cannot write that; choose .usdc, .usda, .usdz, .ply or .blend.")
+        raise InputError(f"{args.out}: cannot write that; choose {', '.join(WRITABLE)} or .blend.")
     else:
         options = {}
         if usd:
@@ -267,6 +274,18 @@ def export(args: argparse.Namespace) -> int:
     return 1 if args.check and complaints else 0
 
 
+def _read(path: Path) -> LoadedAsset:
+    """What a file holds; what is to be said of it is printed."""
+    from .model.io.files import read_asset
+
+    loaded = read_asset(path)
+    if loaded.note:
+        print(f"{path}: {loaded.note}")
+    if loaded.up != "Z":
+        print(f"{path}: {loaded.up} is up in it, as far as is known; nothing is turned, Z is taken for up")
+    return loaded
+
+
 def save_blend(asset: Path, out: Path) -> None:
     """The asset as a .blend that plays without the add-on; Blender runs in a process of its own."""
     import subprocess
@@ -276,6 +295,28 @@ def save_blend(asset: Path, out: Path) -> None:
     if done.returncode:
         reason = (done.stderr.strip() or done.stdout.strip() or "Blender stopped").splitlines()[-1]
         raise InputError(f"{out}: the .blend was not written: {reason}")
+
+
+def view_arguments(p: argparse.ArgumentParser) -> None:
+    p.add_argument("asset", type=Path, help="what `timesplat export` reads: .ply, .splat, .spz, USD, .html, or a "
+                   "folder with a .ply a frame")  # fmt: skip
+
+
+def view(args: argparse.Namespace) -> int:
+    """Play an asset in the browser: writes the page of `timesplat export ASSET NAME.html` to a temporary file and opens
+    it. Nothing is served, and nothing leaves the machine."""
+    import tempfile
+    import webbrowser
+
+    from .model.io.files import write_asset
+
+    asset = _read(args.asset).asset
+    page = Path(tempfile.mkdtemp(prefix="timesplat-")) / f"{args.asset.resolve().stem}.html"
+    write_asset(page, asset)
+    print(f"{page}: {len(asset)} Gaussians, {page.stat().st_size / 1e6:.1f} MB")
+    if not webbrowser.open(page.as_uri()):
+        print("no browser was found; open the page in one")
+    return 0
 
 
 # ---------------------------------------------------------------- evaluate, bench, demo
@@ -349,7 +390,8 @@ COMMANDS = {
     "demo": (demo_arguments, demo, "the whole road in one go, with pictures"),
     "render": (render_arguments, render, "assets to Sequences (Blender)"),
     "reconstruct": (reconstruct_arguments, reconstruct, "a Sequence to a 4D Gaussian asset"),
-    "export": (export_arguments, export, "an asset to USD or .blend"),
+    "export": (export_arguments, export, "an asset to USD, a web page or .blend"),
+    "view": (view_arguments, view, "play an asset in the browser"),
     "evaluate": (evaluate_arguments, evaluate, "score methods on held-out views"),
     "bench": (bench_arguments, bench, "speed against accuracy, in charts"),
     "train": (train_arguments, train, "train a network on Sequences"),

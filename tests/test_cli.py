@@ -149,6 +149,20 @@ def test_other_programs_files_are_exported_and_how_they_lie_is_said(tmp_path, ca
     refused(capsys, "export", tmp_path / "a.obj", tmp_path / "d.ply", says="its name must end in", names="a.obj")
 
 
+def test_view_opens_a_page(tmp_path, capsys, monkeypatch):
+    opened, answers = [], [True, False]
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or answers.pop(0))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    write_ply(tmp_path / "my fox.ply", make_asset(9))
+    for says in ("9 Gaussians", "no browser was found"):
+        assert main(["view", str(tmp_path / "my fox.ply")]) == 0
+        assert says in capsys.readouterr().out
+        assert opened[-1].startswith("file://") and opened[-1].endswith("/my%20fox.html")
+    assert len(list(tmp_path.glob("timesplat-*/my fox.html"))) == 2
+    refused(capsys, "view", tmp_path / "no.ply", says="no such file", names="no.ply")
+    assert len(opened) == len(list(tmp_path.glob("timesplat-*"))) == 2
+
+
 def test_files_that_no_renderer_takes(tmp_path, capsys):
     bad = tmp_path / "bad.glb"
     bad.write_bytes(b"glTF\x02\0\0\0 not really")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""File > Export > 4D Gaussians: the active asset object as .ply, .splat or USD, where and as it is now.
+"""File > Export > 4D Gaussians: the active asset object as .ply, .splat, USD or a web page, where and as it is now.
 
     bpy.ops.timesplat.export_asset(filepath="a.usdz", half=True)          the suffix says the format
     bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame
@@ -37,13 +37,18 @@ from .original_usd import original_usd
 REPORT = "Timesplat USD report"
 SUFFIXES = {
     **{"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz"},
-    **{"SLICE": ".ply", "SPLAT": ".splat", "SLICES": ""},
+    **{"PAGE": ".html", "SLICE": ".ply", "SPLAT": ".splat", "SLICES": ""},
 }
 FORMAT_ITEMS = [
     ("PLY", "4D PLY", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
     ("USDC", "USDC (binary)", "USD for pipelines"),
     ("USDA", "USDA (text)", "USD to look into: large"),
     ("USDZ", "USDZ (package)", "USD in one file with all it needs"),
+    (
+        "PAGE",
+        "Web Page",
+        "One file that plays in any browser, from disk and without network",
+    ),
     ("SLICE", "3DGS PLY, this frame", "For 3DGS viewers and tools: what is visible at the current frame"),
     ("SPLAT", ".splat, this frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
     ("SLICES", "3DGS PLY, all frames", "A new folder with what the timeline shows at every frame of the scene"),
@@ -110,7 +115,7 @@ def format_of(filepath: str, default: str) -> str:
 
 
 class TIMESPLAT_OT_export_asset(bpy.types.Operator):
-    """Export the active 4D Gaussian asset: as .ply or .splat, or as USD"""
+    """Export the active 4D Gaussian asset: as .ply, .splat, USD or a web page"""
 
     bl_idname = "timesplat.export_asset"
     bl_label = "Export 4D Gaussians"
@@ -118,7 +123,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
     filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
     check_existing: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.ply;*.splat;*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"})
+    filter_glob: StringProperty(default="*.ply;*.splat;*.html;*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"})
     format: EnumProperty(name="Format", items=FORMAT_ITEMS, default="PLY")
     apply_sliders: BoolProperty(
         name="Apply Sliders",
@@ -213,7 +218,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         places, animated = places_and_changes(ob, asset.clip.frames, context)
         rest, motion = rest_and_motion(places)
         lost = animated if self.apply_sliders else []
-        if self.format == "PLY":
+        if self.format in ("PLY", "PAGE"):
             write_asset(path, with_place(asset, now))
             lost = lost + ["place"] * (motion is not None)
             level, said = "INFO", f"{len(asset)} Gaussians."
@@ -240,7 +245,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
 
 def _menu(self, context):
-    self.layout.operator("timesplat.export_asset", text="4D Gaussians (.ply, .splat, .usd)")
+    self.layout.operator("timesplat.export_asset", text="4D Gaussians (.ply, .splat, .usd, .html)")
 
 
 def register() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...datagen.sequence import InputError
 from .asset import ARRAYS, MAX_GAUSSIANS, ONE_FRAME_SIGMA, STATIC_SIGMA_T, Asset, Clip, LoadedAsset, check
+from .page import read_page, write_page
 from .pieces import to_pieces
 from .ply import write_ply
 from .slices import write_slice
@@ -31,9 +32,14 @@ READERS: dict[str, Callable[[Path], LoadedAsset]] = {
     ".ply": read_any_ply,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".html": read_page,
     **dict.fromkeys(USD_SUFFIXES, _read_usd),
 }
-WRITERS: dict[str, Callable[..., None]] = {".ply": write_ply, **dict.fromkeys(USD_SUFFIXES, write_usd)}
+WRITERS: dict[str, Callable[..., None]] = {
+    ".ply": write_ply,
+    ".html": write_page,
+    **dict.fromkeys(USD_SUFFIXES, write_usd),
+}
 READABLE, WRITABLE = tuple(READERS), tuple(WRITERS)
 
 

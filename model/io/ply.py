@@ -13,7 +13,6 @@ version 1 would pass over them and see straight lines without end.
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +53,13 @@ def write_ply(path: str | Path, asset: Asset) -> None:
     are moved to that distance, and that paths are rounded (see ply_paths.py). The velocity of what rides on a path is
     written as the path has it at the Gaussian's own time."""
     check(asset, path)
+    data = asset_bytes(asset)
+    with atomic_write(path) as tmp:
+        tmp.write_bytes(data)
+
+
+def asset_bytes(asset: Asset) -> bytes:
+    """What `write_ply` writes."""
     tables = {} if asset.paths is None else path_tables(asset.paths)
     if tables:
         asset = replace(asset, velocity=asset.path_velocity())
@@ -63,8 +69,7 @@ def write_ply(path: str | Path, asset: Asset) -> None:
     if tables:
         columns["path"] = asset.path
     comments = [f"timesplat {key} {value}" for key, value in _metadata(asset.clip, 2 if tables else 1)]
-    with atomic_write(path) as tmp:
-        tmp.write_bytes(ply_bytes(columns, comments, **tables))
+    return ply_bytes(columns, comments, **tables)
 
 
 def columns_3dgs(asset: Asset) -> dict[str, np.ndarray]:
@@ -114,7 +119,18 @@ def read_ply(path: str | Path) -> Asset:
     properties (normals, f_rest_*) are passed over; quaternions are normalised, zero ones become the
     identity. Raises InputError: one sentence with the file, what is wrong and what to do."""
     path = Path(path)
-    tables, meta = _read_tables(path)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the name.") from None
+    except OSError as e:
+        raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
+    return asset_from_bytes(data, path)
+
+
+def asset_from_bytes(data: bytes, path: Path) -> Asset:
+    """`read_ply` of what is in memory; the path is for errors."""
+    tables, meta = _read_tables(data, path)
     rows = tables["vertex"]
     moves = _is_4d(rows.dtype.names, path)
     count = len(rows)
@@ -155,28 +171,21 @@ def read_ply(path: str | Path) -> Asset:
     return asset
 
 
-def _read_tables(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _read_tables(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """-> the vertices as a record array, and the paths and knots where the vertices are on some; and the
     `comment timesplat` values."""
     tables = {}
-    try:
-        with open(path, "rb") as f:
-            elements, meta, offset = _header(f.read(MAX_HEADER_BYTES), path)
-            have = os.fstat(f.fileno()).st_size - offset
-            f.seek(offset)
-            for name, (dtype, count) in elements.items():
-                if have < count * dtype.itemsize:
-                    raise InputError(
-                        f"{path}: the file is truncated, {count} {_CONTENTS[name]} were announced and there is data "
-                        f"for {have // dtype.itemsize}; copy or export it again."
-                    )
-                have -= count * dtype.itemsize
-                tables[name] = np.fromfile(f, dtype, count)
-            return tables, meta
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the name.") from None
-    except OSError as e:
-        raise InputError(f"{path}: it cannot be read ({e.strerror or e}); check the file.") from None
+    elements, meta, at = _header(data[:MAX_HEADER_BYTES], path)
+    for name, (dtype, count) in elements.items():
+        have = max(len(data) - at, 0)
+        if have < count * dtype.itemsize:
+            raise InputError(
+                f"{path}: the file is truncated, {count} {_CONTENTS[name]} were announced and there is data "
+                f"for {have // dtype.itemsize}; copy or export it again."
+            )
+        tables[name] = np.frombuffer(data, dtype, count, at)
+        at += count * dtype.itemsize
+    return tables, meta
 
 
 def _is_4d(names: tuple[str, ...], path: Path) -> bool:

@@ -17,6 +17,7 @@ ALLOWED = [
     *("addon/*.py", "addon/*/*.py", "datagen/*.py", "datagen/*/*.py", "model/*.py"),
     *("model/deformation/*.py", "model/fitting/*.py", "model/geometry/*.py", "model/io/*.py"),
     *("model/rasterize/*.py", "model/rasterize/*/*.py"),
+    "model/io/player/*",
     *("model/checkpoints/*.safetensors", "model/checkpoints/*.md"),
 ]
 NEEDED = {

@@ -59,7 +59,7 @@ def page(tmp_path_factory, fox) -> Path:
     write_ply(folder / "fox.ply", fox)
     make_original(folder)
     commands = [line.split("#")[0].split()[1:] for line in PAGE.splitlines() if re.match(r"timesplat export \w", line)]
-    assert len(commands) == 8
+    assert len(commands) == 9
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for command in commands:

@@ -52,6 +52,15 @@ def test_4d_ply_comes_back_the_same(blender, folder):
     assert sorted(os.listdir(folder)) == ["in.ply", "out.ply"]
 
 
+def test_a_page_holds_what_the_ply_does(blender, folder):
+    told = blender(
+        EXPORT + "tell(done=save('out.html'), other=save('a.usdc', format='PAGE'), ply=save('out.ply'))", folder
+    )
+    assert told["done"] == told["other"] == ["FINISHED"]
+    assert sorted(os.listdir(folder)) == ["a.html", "in.ply", "out.html", "out.ply"]
+    same(formats.read_asset(folder / "out.html").asset, read_ply(folder / "out.ply"), 0, 0)
+
+
 def test_deleted_gaussians_and_sliders_reach_the_file(blender, folder):
     code = """
 edit.keep_gaussians(ob, np.arange(120) % 3 > 0)

@@ -142,8 +142,11 @@ def test_options_go_to_the_writer(tmp_path):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (read_asset, "its name must end in .ply, .splat, .spz, .usd, .usdc, .usda, .usdz; choose one of these."),
-        (lambda path: write_asset(path, make_asset()), "cannot write that; choose .ply, .usd, .usdc, .usda, .usdz."),
+        (read_asset, "its name must end in .ply, .splat, .spz, .html, .usd, .usdc, .usda, .usdz; choose one of these."),
+        (
+            lambda path: write_asset(path, make_asset()),
+            "that; choose .ply, .html, .usd, .usdc, .usda, .usdz.",
+        ),
         (lambda path: write_asset(path, make_asset(), frame=3), "the name of a slice must end in .ply or .splat;"),
     ],
 )
