@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -213,6 +213,7 @@ def export_arguments(p: argparse.ArgumentParser) -> None:
         nargs="?",
         help=".usdc, .usda, .usdz, .ply, .html (a page that plays it), .blend to write; .splat with --frame",
     )
+    _up_argument(p)
     p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
                    "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
     p.add_argument("--half", action="store_true", help="USD: half precision")
@@ -245,7 +246,7 @@ def export(args: argparse.Namespace) -> int:
         raise InputError("export: --frame is for one .ply or .splat; drop it.")
     if args.pieces and (args.sequence or args.frame is not None):
         raise InputError("export: --pieces is for what has time, not for moments; drop it.")
-    loaded = _read(args.asset)
+    loaded = _read(args.asset, args.up)
     asset, count = loaded.asset, len(loaded.asset)
     if loaded.motion is not None and not usd:
         print(f"{args.asset}: it moves as a whole; what is written stands where that starts, USD would keep it")
@@ -274,16 +275,22 @@ def export(args: argparse.Namespace) -> int:
     return 1 if args.check and complaints else 0
 
 
-def _read(path: Path) -> LoadedAsset:
-    """What a file holds; what is to be said of it is printed."""
-    from .model.io.files import read_asset
+def _read(path: Path, up: str | None) -> LoadedAsset:
+    """What a file holds, turned so that Z is up in place of `up`; what is to be said of it is printed."""
+    from .model.io.files import read_asset, upright
 
     loaded = read_asset(path)
     if loaded.note:
         print(f"{path}: {loaded.note}")
-    if loaded.up != "Z":
-        print(f"{path}: {loaded.up} is up in it, as far as is known; nothing is turned, Z is taken for up")
-    return loaded
+    if loaded.up != "Z" and not up:
+        print(f"{path}: {loaded.up} is up in it, as far as is known; it is turned so that Z is. --up says otherwise")
+    return replace(loaded, asset=upright(loaded, up), up="Z")
+
+
+def _up_argument(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--up", choices=["Z", "Y", "-Y"], help="what points up in the file (default: Z in Timesplat's own "
+                   "and in USD, Y in .spz, -Y in other .ply and .splat, which say nothing, as in captures that 3DGS "
+                   "is trained on)")  # fmt: skip
 
 
 def save_blend(asset: Path, out: Path) -> None:
@@ -300,6 +307,7 @@ def save_blend(asset: Path, out: Path) -> None:
 def view_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("asset", type=Path, help="what `timesplat export` reads: .ply, .splat, .spz, USD, .html, or a "
                    "folder with a .ply a frame")  # fmt: skip
+    _up_argument(p)
 
 
 def view(args: argparse.Namespace) -> int:
@@ -310,7 +318,7 @@ def view(args: argparse.Namespace) -> int:
 
     from .model.io.files import write_asset
 
-    asset = _read(args.asset).asset
+    asset = _read(args.asset, args.up).asset
     page = Path(tempfile.mkdtemp(prefix="timesplat-")) / f"{args.asset.resolve().stem}.html"
     write_asset(page, asset)
     print(f"{page}: {len(asset)} Gaussians, {page.stat().st_size / 1e6:.1f} MB")

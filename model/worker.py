@@ -19,7 +19,7 @@ to do; null or "" is the same as leaving a key out:
         done: out, complaints (the validator's, a list of sentences), bytes
     import          the other way round             (never imports torch)
         source      .usd* to read                   asset       .ply to write
-        motion      .npy to write where the asset moves as a whole (see read_usd_with_motion)
+        motion      .npy to write where the asset moves as a whole (see load_usd)
         done: asset, gaussians
     selftest        does this interpreter reconstruct?
         device, checkpoint
@@ -189,15 +189,15 @@ def _matrices(path: str) -> np.ndarray:
 def _import(request: dict, progress) -> dict:
     _limit_memory()
     from .io.ply import write_ply
-    from .io.usd_read import read_usd_with_motion
+    from .io.usd_read import load_usd
 
     progress(0.0, f"reading {Path(request['source']).name}")
-    asset, motion = read_usd_with_motion(request["source"])
+    loaded = load_usd(request["source"])
     progress(0.7, "writing the asset")
-    write_ply(request["asset"], asset)
-    if motion is not None and "motion" in request:
-        np.save(request["motion"], motion)
-    return {"asset": request["asset"], "gaussians": len(asset)}
+    write_ply(request["asset"], loaded.asset)
+    if loaded.motion is not None and "motion" in request:
+        np.save(request["motion"], loaded.motion)
+    return {"asset": request["asset"], "gaussians": len(loaded.asset), "note": loaded.note}
 
 
 def _selftest(request: dict, progress) -> dict:

@@ -6,12 +6,13 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from timesplat.cli import COMMANDS, main
 from timesplat.model.io.ply import read_ply, write_ply
 
-from .assets import make_asset, tracked_asset
+from .assets import assert_same, make_asset, tracked_asset
 
 
 def refused(capsys, *argv, says: str, names: str = "") -> None:
@@ -147,6 +148,32 @@ def test_other_programs_files_are_exported_and_how_they_lie_is_said(tmp_path, ca
         assert ("-Y is up in it" in capsys.readouterr().out) == (words in ("a.splat b.ply", "frames c.ply"))
     assert (tmp_path / "b.ply").stat().st_size > 1000 and read_ply(tmp_path / "c.ply").clip.frames == range(1, 25)
     refused(capsys, "export", tmp_path / "a.obj", tmp_path / "d.ply", says="its name must end in", names="a.obj")
+
+
+def test_a_slice_of_a_slice_is_the_slice(tmp_path, capsys):
+    """-Y is up in it, and is up again; in USD and in our .ply Z is, over the asset."""
+    asset = make_asset(sigma=(9, 10))
+    write_ply(tmp_path / "a.ply", asset)
+    for words in ("a.ply s.ply --frame 20", "s.ply t.ply --frame 1", "s.ply z.ply", "s.ply kept.ply --up Z"):
+        capsys.readouterr()
+        assert main(["export", *(str(tmp_path / w) if w.endswith(".ply") else w for w in words.split())]) == 0
+        assert ("it is turned so that Z is" in capsys.readouterr().out) == (words[0] == "s" and "--up" not in words)
+    one, two, standing, kept = (read_ply(tmp_path / f"{n}.ply") for n in ("s", "t", "z", "kept"))
+    assert_same(one, two, 1e-5, 2e-6)
+    np.testing.assert_allclose(kept.xyz, one.xyz, atol=1e-6)
+    world = asset.at(asset.frame_to_time(20))[0] * 2 + (1, 2, 3)
+    np.testing.assert_allclose(standing.xyz + standing.clip.translation, world, atol=1e-5)
+
+
+def test_what_is_left_out_is_said(tmp_path, capsys):
+    write_ply(tmp_path / "a.ply", make_asset(9))
+    assert main(["export", str(tmp_path / "a.ply"), str(tmp_path / "s.ply"), "--frame", "20"]) == 0
+    data = bytearray((tmp_path / "s.ply").read_bytes())
+    data[-56:-52] = np.float32(np.nan).tobytes()  # x of the last one
+    (tmp_path / "s.ply").write_bytes(data)
+    capsys.readouterr()
+    assert main(["export", str(tmp_path / "s.ply"), str(tmp_path / "b.ply")]) == 0
+    assert "Gaussians are left out: NaN, or beyond all bounds, in position" in capsys.readouterr().out
 
 
 def test_view_opens_a_page(tmp_path, capsys, monkeypatch):

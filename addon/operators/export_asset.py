@@ -22,7 +22,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from ...datagen.sequence import InputError
 from ...model.io import slices
 from ...model.io.asset import Asset
-from ...model.io.files import write_asset
+from ...model.io.files import WRITABLE, write_asset
 from ...model.io.placement import place_asset, rest_and_motion
 from ...model.io.ply import write_ply
 from ...model.io.usd_check import check_usd
@@ -123,7 +123,9 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
     filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
     check_existing: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.ply;*.splat;*.html;*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"})
+    filter_glob: StringProperty(
+        default=";".join(sorted({f"*{s}" for s in (*WRITABLE, *SUFFIXES.values()) if s})), options={"HIDDEN"}
+    )
     format: EnumProperty(name="Format", items=FORMAT_ITEMS, default="PLY")
     apply_sliders: BoolProperty(
         name="Apply Sliders",

@@ -53,12 +53,12 @@ def read_assets(paths: list[Path], *, fps: float, frame_start: int, context=None
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
         try:
-            child_process.ask_worker(python, request)
+            told = child_process.ask_worker(python, request)
         except InputError as e:
             if not str(e).startswith("The process "):
                 raise  # it named the file
             raise InputError(f"{path}: the USD library gave up on it; it is damaged, export it again. {e}.") from None
-        return LoadedAsset(read_ply(copy), "Z", motion=np.load(moves) if moves.exists() else None)
+        return LoadedAsset(read_ply(copy), "Z", told["note"], np.load(moves) if moves.exists() else None)
 
 
 def key_motion(ob, frames: range, motion: np.ndarray) -> bool:
@@ -164,7 +164,8 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         asset, path = loaded.asset, paths[0]
         name = path.stem if len(paths) == 1 else path.parent.name
         ob = display.add_asset(asset, name, look=self.look, cut=self.opacity_cut, context=context)
-        ob.rotation_euler.x = TURN_ABOUT_X[loaded.up if self.up == "AUTO" else self.up]
+        turn = TURN_ABOUT_X[loaded.up if self.up == "AUTO" else self.up]
+        ob.rotation_euler.x, ob.location = turn, Matrix.Rotation(turn, 3, "X") @ ob.location
         note = loaded.note
         if loaded.motion is not None:
             context.view_layer.update()

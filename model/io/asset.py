@@ -18,6 +18,8 @@ VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment
 STATIC_SIGMA_T = 1e4  # lifetime of what does not change: exp(-½(2/1e4)²) is 1 in float32
 ONE_FRAME_SIGMA = 1 / 3  # σ_t, in frames, of what shows at one frame: 1.1 % of its opacity is left a frame away
 SCREEN_BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
+SMALLEST_SCALE = 1e-9  # other programs' splats are at least so large
+FAR = 256  # times its size (or units, what is smaller than one) away from the origin, float32 costs 1e-5 of that
 MAX_GAUSSIANS = 10_000_000  # that a compressed file or a sequence may hold, as in Niantic's reader
 MAX_CLIP_FRAMES = 50_000  # more than half an hour
 MAX_FRAME_NUMBER = 1 << 20  # as far as Blender counts
@@ -153,15 +155,58 @@ class LoadedAsset:
 def static_asset(source: str | Path, xyz, scale, rotation, rgb, opacity) -> Asset:
     """An asset that does not change from arrays of any float dtype, as in Asset; quaternions are normalised. Raises
     InputError (see `check`)."""
+    asset = unchecked_static_asset(xyz, scale, rotation, rgb, opacity)
+    check(asset, source)
+    return asset
+
+
+def unchecked_static_asset(xyz, scale, rotation, rgb, opacity) -> Asset:
+    """The same of numbers that others wrote, for `sound_part`."""
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    rotation = np.where(length > 0, rotation / np.maximum(length, 1e-30), [1.0, 0, 0, 0])
+    rotation = np.where(length == 0, [1.0, 0, 0, 0], rotation / np.maximum(length, 1e-30))
     n = len(xyz)
     arrays = {"xyz": xyz, "t": np.zeros(n), "velocity": np.zeros((n, 3)), "sigma_t": np.full(n, STATIC_SIGMA_T)}
     arrays |= {"scale": scale, "rotation": rotation, "rgb": rgb, "opacity": opacity}
-    exact: dict[str, Any] = {k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()}
-    asset = Asset(**exact, clip=Clip())
+    with np.errstate(over="ignore", invalid="ignore"):
+        exact: dict[str, Any] = {k: np.ascontiguousarray(a, np.float32) for k, a in arrays.items()}
+    return Asset(**exact, clip=Clip())
+
+
+def near_origin(xyz: np.ndarray) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Positions (N,3) float64 and where they are counted from: their middle where that is FAR away, as in the
+    coordinates of maps, which float32 would round; else the origin."""
+    finite = xyz[np.isfinite(xyz).all(1)]
+    if not len(finite):
+        return xyz, (0.0, 0.0, 0.0)
+    low, middle, high = np.percentile(finite, (5, 50, 95), axis=0)
+    if np.abs(middle).max() <= FAR * max((high - low).max(), 1):
+        return xyz, (0.0, 0.0, 0.0)
+    x, y, z = np.round(middle).tolist()
+    return xyz - (x, y, z), (x, y, z)
+
+
+_WORDS = {"xyz": "position", "t": "time", "sigma_t": "lifetime", "rgb": "colour"}
+
+
+def sound_part(asset: Asset, source: str | Path) -> tuple[Asset, str]:
+    """Of an unchecked asset of others the Gaussians whose numbers are finite, with opacities clamped to 0..1; and a
+    sentence on what was left out or clamped, or nothing. Raises InputError: none is left; and see `check`."""
+    n, notes = len(asset), []
+    if n == 0 or any(len(getattr(asset, k)) != n for k in ARRAYS):
+        check(asset, source)
+    bad = {k: ~np.isfinite(getattr(asset, k)).reshape(n, -1).all(1) for k in ARRAYS}
+    named = " and ".join(_WORDS.get(k, k) for k, rows in bad.items() if rows.any())
+    lost = np.logical_or.reduce(list(bad.values()))
+    if n and lost.all():
+        raise InputError(f"{source}: {named} of all its {n} Gaussians holds NaN or infinity; export it again.")
+    if lost.any():
+        asset = asset[~lost]
+        notes.append(f"{lost.sum()} of {n} Gaussians are left out: NaN, or beyond all bounds, in {named}.")
+    if beyond := int(((asset.opacity < -0.01) | (asset.opacity > 1.01)).sum()):
+        notes.append(f"The opacities of {beyond} Gaussians are clamped to 0..1.")
+    asset = replace(asset, opacity=np.clip(asset.opacity, 0, 1))
     check(asset, source)
-    return asset
+    return asset, " ".join(notes)
 
 
 def check(asset: Asset, source: str | Path = "the asset") -> None:
@@ -244,3 +289,9 @@ def linear_from_srgb(rgb: np.ndarray) -> np.ndarray:
     """sRGB-encoded values (any shape) -> linear light, clamped to 0..1."""
     x = np.clip(rgb, 0, 1)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def srgb_from_linear(rgb: np.ndarray) -> np.ndarray:
+    """The way back of `linear_from_srgb`."""
+    x = np.clip(rgb, 0, 1)
+    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)

@@ -15,25 +15,20 @@ from ...datagen.sequence import InputError
 from .asset import ARRAYS, MAX_GAUSSIANS, ONE_FRAME_SIGMA, STATIC_SIGMA_T, Asset, Clip, LoadedAsset, check
 from .page import read_page, write_page
 from .pieces import to_pieces
+from .placement import place_asset
 from .ply import write_ply
 from .slices import write_slice
 from .splat_files import read_any_ply, read_splat, read_spz
-from .usd_read import read_usd_with_motion
+from .usd_read import load_usd
 from .usd_stage import USD_SUFFIXES
 from .usd_write import write_usd
-
-
-def _read_usd(path: Path) -> LoadedAsset:
-    asset, motion = read_usd_with_motion(path)
-    return LoadedAsset(asset, "Z", motion=motion)
-
 
 READERS: dict[str, Callable[[Path], LoadedAsset]] = {
     ".ply": read_any_ply,
     ".splat": read_splat,
     ".spz": read_spz,
     ".html": read_page,
-    **dict.fromkeys(USD_SUFFIXES, _read_usd),
+    **dict.fromkeys(USD_SUFFIXES, load_usd),
 }
 WRITERS: dict[str, Callable[..., None]] = {
     ".ply": write_ply,
@@ -69,6 +64,25 @@ def write_asset(path: str | Path, asset: Asset, *, frame: float | None = None, p
     return len(asset)
 
 
+# ---------------------------------------------------------------- what is up
+
+
+UP_AXES = {"Z": (0, 0, 1), "Y": (0, 1, 0), "-Y": (0, -1, 0)}  # of files
+
+
+def upright(loaded: LoadedAsset, up: str | None = None) -> Asset:
+    """The asset turned about X so that Z is up, in place of `up`, one of UP_AXES; by default what is known of the
+    file. Exact but for rounding (see `place_asset`)."""
+    _, y, z = UP_AXES[up or loaded.up]
+    if z:
+        return loaded.asset
+    clip = loaded.asset.clip
+    turn, own = np.eye(4), np.diag([clip.scale, clip.scale, clip.scale, 1.0])
+    turn[1:3, 1:3] = [[0, -y], [y, 0]]
+    own[:3, 3] = clip.translation
+    return place_asset(loaded.asset, turn @ own)
+
+
 # ---------------------------------------------------------------- a file a frame
 
 
@@ -90,6 +104,7 @@ def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: 
     clip = Clip(fps, frame_start, frame_start + len(files) - 1)
     sigma_t = np.float32(ONE_FRAME_SIGMA * 2 / (len(files) - 1))
     parts: list[Asset] = []
+    middle = np.zeros(3)  # from which all count, where they are far from the origin
     ups, notes, total = set(), [], 0
     for frame, path in zip(clip.frames, files, strict=True):
         loaded = _read_file(path)
@@ -104,7 +119,11 @@ def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: 
                 f"{path}: with it the sequence has more than {MAX_GAUSSIANS:,} Gaussians; choose fewer files."
             )
         own = np.full(n, clip.frame_to_time(frame), np.float32)
-        parts.append(replace(asset, t=own, sigma_t=np.full(n, sigma_t)))
+        middle = middle if parts else np.array(asset.clip.translation)
+        xyz = (asset.xyz + (np.array(asset.clip.translation) - middle)).astype(np.float32)
+        parts.append(replace(asset, xyz=xyz, t=own, sigma_t=np.full(n, sigma_t)))
+    x, y, z = middle.tolist()
+    clip = replace(clip, translation=(x, y, z))
     asset = Asset(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in ARRAYS}, clip=clip)
     check(asset, files[0].parent)
     return LoadedAsset(asset, ups.pop(), next(filter(None, notes), ""))

@@ -13,16 +13,16 @@ version 1 would pass over them and see straight lines without end.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...datagen.sequence import InputError
-from .asset import ARRAYS, SH_C0, STATIC_SIGMA_T, Asset, Clip, check
+from .asset import ARRAYS, SH_C0, SMALLEST_SCALE, STATIC_SIGMA_T, Asset, Clip, check, near_origin, sound_part
 from .atomic import atomic_write
 from .ply_paths import path_tables, paths_from_tables
+from .ply_tables import PlyTables
 
 POSITION, COLOUR, SCALE = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("scale_0", "scale_1", "scale_2")
 ROTATION, VELOCITY = ("rot_0", "rot_1", "rot_2", "rot_3"), ("vx", "vy", "vz")
@@ -31,14 +31,9 @@ PROPERTIES_4D = ("t", "scale_t", *VELOCITY)
 
 OPACITY_MARGIN = 1e-6  # opacities are kept this far from 0 and 1, because they are written as logits
 FORMAT_VERSION = 2  # that can be read; what has no paths is written as version 1
-MAX_HEADER_BYTES = 1 << 16
-_NUMPY_TYPES = {
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
-    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
-    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
-}
+PLAIN_COLOUR = ("red", "green", "blue")  # of other programs, in place of COLOUR
+FLAT_SCALE, FLATNESS = "scale_2", 1e-3  # what discs lack, and how thick they are by their shorter side
 _PLY_TYPES = {"<f4": "float", "<i4": "int", "<i2": "short"}
-_CONTENTS = {"vertex": "Gaussians", "path": "paths", "knot": "knots"}
 
 
 # ---------------------------------------------------------------- writing
@@ -114,10 +109,11 @@ def _metadata(clip: Clip, version: int) -> list[tuple[str, object]]:
 
 
 def read_ply(path: str | Path) -> Asset:
-    """Reads what `write_ply` wrote, or any uncompressed binary 3DGS .ply: without the time columns it is a
-    static asset (v = 0, t = 0, sigma_t = STATIC_SIGMA_T), without comments the clip is Clip(). Unknown
-    properties (normals, f_rest_*) are passed over; quaternions are normalised, zero ones become the
-    identity. Raises InputError: one sentence with the file, what is wrong and what to do."""
+    """Reads what `write_ply` wrote, or any uncompressed .ply of Gaussians, binary or ascii: without the time columns it
+    is a static asset (v = 0, t = 0, sigma_t = STATIC_SIGMA_T), without comments the clip is Clip(), but for what is far
+    from the origin (see `asset.near_origin`). Discs without a third scale (2DGS) are flat Gaussians; red, green, blue
+    in place of f_dc_* are colours. Unknown properties (normals, f_rest_*) are passed over; quaternions are normalised,
+    zero ones become the identity. Raises InputError: one sentence with the file, what is wrong and what to do."""
     path = Path(path)
     try:
         data = path.read_bytes()
@@ -130,67 +126,80 @@ def read_ply(path: str | Path) -> Asset:
 
 def asset_from_bytes(data: bytes, path: Path) -> Asset:
     """`read_ply` of what is in memory; the path is for errors."""
-    tables, meta = _read_tables(data, path)
-    rows = tables["vertex"]
-    moves = _is_4d(rows.dtype.names, path)
+    tables = PlyTables(data, path)
+    rows = tables.table("vertex")
+    for name in (*PROPERTIES_3DGS, *PROPERTIES_4D, "path"):
+        if name in tables.names("vertex") and (lost := int((~np.isfinite(rows[name])).sum())):
+            raise InputError(
+                f"{path}: {name} holds NaN or infinity in {lost} of {len(rows)} Gaussians; "
+                "remove those Gaussians or export the file again."
+            )
+    asset = _asset(tables)
+    check(asset, path)
+    return asset
+
+
+def sound_asset_from_bytes(data: bytes, path: Path) -> tuple[Asset, str]:
+    """The same without the Gaussians that hold NaN or are beyond all bounds, and what is to be said of them."""
+    return sound_part(_asset(PlyTables(data, path)), path)
+
+
+def _asset(tables: PlyTables) -> Asset:
+    """Unchecked."""
+    path, rows = tables.path, tables.table("vertex")
+    names = tables.names("vertex")
+    coloured = not set(COLOUR) <= set(names) and set(PLAIN_COLOUR) <= set(names)
+    moves = _is_4d(names, set(PROPERTIES_3DGS) - set(COLOUR if coloured else ()) - {FLAT_SCALE}, path)
     count = len(rows)
 
     def get(*properties: str) -> np.ndarray:
         """(N,k), or (N,) of one property."""
         out = np.stack([rows[p] for p in properties], -1).astype(np.float64)
-        wrong = ~np.isfinite(out)
-        if wrong.any():
-            prop = properties[int(wrong.any(0).argmax())]
-            raise InputError(
-                f"{path}: {prop} holds NaN or infinity in {wrong.any(1).sum()} of {count} Gaussians; "
-                "remove those Gaussians or export the file again."
-            )
         return out if len(properties) > 1 else out.squeeze(1)
 
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN, and what overflows, is for the caller
         quaternion = get(*ROTATION)
         length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-        quaternion = np.where(length > 0, quaternion / np.maximum(length, 1e-300), [1.0, 0, 0, 0])
+        quaternion = np.where(length == 0, [1.0, 0, 0, 0], quaternion / np.maximum(length, 1e-300))
+        scale = np.exp(get(*(name for name in SCALE if name in names)))
+        if FLAT_SCALE not in names:
+            scale = np.concatenate([scale, FLATNESS * scale.min(1, keepdims=True)], 1)
+        xyz, clip = get(*POSITION), _clip(tables.meta, path)
+        if not tables.meta:
+            scale = np.maximum(scale, SMALLEST_SCALE)
+            xyz, translation = near_origin(xyz)
+            clip = replace(clip, translation=translation)
         arrays = {
-            "xyz": get(*POSITION),
+            "xyz": xyz,
             "t": get("t") if moves else np.zeros(count),
             "velocity": get(*VELOCITY) if moves else np.zeros((count, 3)),
             "sigma_t": np.exp(get("scale_t")) if moves else np.full(count, STATIC_SIGMA_T),
-            "scale": np.exp(get(*SCALE)),
+            "scale": scale,
             "rotation": quaternion,
-            "rgb": 0.5 + SH_C0 * get(*COLOUR),
+            "rgb": _plain_colour(rows) if coloured else 0.5 + SH_C0 * get(*COLOUR),
             "opacity": 1 / (1 + np.exp(-get("opacity"))),
         }
-        asset = Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=_clip(meta, path))
-    if "path" in tables:
-        paths, index = paths_from_tables(tables["path"], tables["knot"], path), get("path")
-        if not ((index >= 0) & (index < len(paths)) & (index == np.floor(index))).all():
-            raise InputError(f"{path}: it has Gaussians on paths that are not there; export it again.")
-        asset = replace(asset, path=index.astype(np.int32), paths=paths)
-    check(asset, path)
-    return asset
+        asset = Asset(**{k: a.astype(np.float32) for k, a in arrays.items()}, clip=clip)
+    if "path" not in names:
+        return asset
+    if not {"path", "knot"} <= tables.counts.keys():
+        raise InputError(f"{path}: its Gaussians are on paths that it lacks; export it again from Timesplat.")
+    paths, index = paths_from_tables(tables.table("path"), tables.table("knot"), path), get("path")
+    if not ((index >= 0) & (index < len(paths)) & (index == np.floor(index))).all():
+        raise InputError(f"{path}: it has Gaussians on paths that are not there; export it again.")
+    return replace(asset, path=index.astype(np.int32), paths=paths)
 
 
-def _read_tables(data: bytes, path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """-> the vertices as a record array, and the paths and knots where the vertices are on some; and the
-    `comment timesplat` values."""
-    tables = {}
-    elements, meta, at = _header(data[:MAX_HEADER_BYTES], path)
-    for name, (dtype, count) in elements.items():
-        have = max(len(data) - at, 0)
-        if have < count * dtype.itemsize:
-            raise InputError(
-                f"{path}: the file is truncated, {count} {_CONTENTS[name]} were announced and there is data "
-                f"for {have // dtype.itemsize}; copy or export it again."
-            )
-        tables[name] = np.frombuffer(data, dtype, count, at)
-        at += count * dtype.itemsize
-    return tables, meta
+def _plain_colour(rows: np.ndarray) -> np.ndarray:
+    """(N,3) sRGB-encoded: whole numbers fill their type, others go from 0 to 1."""
+    columns = [rows[name] / (np.iinfo(rows[name].dtype).max if rows[name].dtype.kind in "iu" else 1) for name in
+               PLAIN_COLOUR]  # fmt: skip
+    return np.stack(columns, 1)
 
 
-def _is_4d(names: tuple[str, ...], path: Path) -> bool:
-    """Whether the properties of time are there. Raises InputError if some of them are not, or those of a splat."""
-    if missing := [p for p in PROPERTIES_3DGS if p not in names]:
+def _is_4d(names: list[str], needed: set[str], path: Path) -> bool:
+    """Whether the properties of time are there. Raises InputError if some of them are not, or those that are needed."""
+    if missing := [p for p in PROPERTIES_3DGS if p in needed and p not in names]:
         hint = "it is a compressed splat file" if "packed_position" in names else "it is not a Gaussian splat"
         raise InputError(
             f"{path}: the property {missing[0]} is missing, {hint}; export it as an uncompressed 3DGS .ply."
@@ -200,50 +209,6 @@ def _is_4d(names: tuple[str, ...], path: Path) -> bool:
         lost = next(p for p in PROPERTIES_4D if p not in names)
         raise InputError(f"{path}: it has {found[0]} but lacks {lost}; export it again from Timesplat.")
     return bool(found)
-
-
-def _header(head: bytes, path: Path) -> tuple[dict[str, tuple[np.dtype, int]], dict[str, str], int]:
-    """-> row dtype and number of rows of the elements that count, `comment timesplat` values, where the data begins."""
-    if not re.match(rb"ply\r?\n", head):
-        raise InputError(f"{path}: it is not a .ply file; choose a Gaussian splat .ply.")
-    end = re.search(rb"\nend_header\r?\n", head)
-    if end is None:
-        raise InputError(f"{path}: the header has no end, the file is truncated; copy or export it again.")
-    order, meta = "", {}
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []  # name, count, (name, type) of the properties
-    try:
-        for line in head[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
-            word = line.split()
-            if word[:1] == ["format"]:
-                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(word[1], "")
-                if not order:
-                    raise InputError(f"{path}: its format is {word[1]}; convert it to a binary .ply.")
-            elif word[:2] == ["comment", "timesplat"]:
-                meta[word[2]] = " ".join(word[3:])
-            elif word[:1] == ["element"]:
-                elements.append((word[1], int(word[2]), []))
-            elif word[:1] == ["property"]:
-                elements[-1][2].append((word[2], word[1]))
-        if not elements or elements[0][0] != "vertex":
-            first = elements[0][0] if elements else "nothing"
-            raise InputError(
-                f"{path}: its first element is {first}, not vertex; export it as an uncompressed 3DGS .ply."
-            )
-        if not order:
-            raise ValueError("it names no format")
-        on_paths = "path" in dict(elements[0][2])
-        if on_paths and [name for name, *_ in elements[1:3]] != ["path", "knot"]:
-            raise InputError(f"{path}: its Gaussians are on paths that it lacks; export it again from Timesplat.")
-        found = {}
-        for name, count, properties in elements[: 3 if on_paths else 1]:
-            if count < 0 or not properties:
-                raise ValueError(f"no {_CONTENTS[name]}")
-            found[name] = np.dtype([(prop, order + _NUMPY_TYPES[kind]) for prop, kind in properties]), count
-        return found, meta, end.end()
-    except InputError:
-        raise
-    except (ValueError, KeyError, IndexError, TypeError) as e:
-        raise InputError(f"{path}: the header is damaged ({e}); copy or export it again.") from None
 
 
 def _clip(meta: dict[str, str], path: Path) -> Clip:

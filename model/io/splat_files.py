@@ -2,7 +2,7 @@
 """Readers of other programs' Gaussian splats, one for each kind of file; `files.read_asset` chooses among them.
 numpy and the standard library only, for inside Blender.
 
-3DGS .ply (by `read_ply`), SuperSplat's compressed .ply, .splat (antimatter15), .spz (Niantic, versions 1 to 4). Colour
+3DGS .ply (see ply.py), SuperSplat's compressed .ply, .splat (antimatter15), .spz (Niantic, versions 1 to 4). Colour
 that depends on the direction (spherical harmonics beyond degree 0) is left out. Nothing of a file is believed before
 it is checked; what is wrong with it is one InputError. The other way, one moment of a 4D asset for other programs:
 slices.py.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -24,8 +25,18 @@ from pathlib import Path
 import numpy as np
 
 from ...datagen.sequence import InputError
-from .asset import MAX_GAUSSIANS, SH_C0, Asset, LoadedAsset, static_asset, wxyz_from_xyzw
-from .ply import MAX_HEADER_BYTES, read_ply
+from .asset import (
+    MAX_GAUSSIANS,
+    SH_C0,
+    SMALLEST_SCALE,
+    Asset,
+    LoadedAsset,
+    sound_part,
+    unchecked_static_asset,
+    wxyz_from_xyzw,
+)
+from .ply import sound_asset_from_bytes
+from .ply_tables import MAX_HEADER_BYTES, PlyTables
 
 SCALE_BOUNDS = ("scale_x", "scale_y", "scale_z")  # of a compressed .ply's chunks
 SPLAT_RECORD = np.dtype(
@@ -80,27 +91,34 @@ def _with_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def read_any_ply(path: Path) -> LoadedAsset:
     """Our own .ply, other programs' 3DGS .ply, and SuperSplat's compressed one."""
-    with open(path, "rb") as f:
-        head, found, _ = f.read(MAX_HEADER_BYTES).partition(b"end_header")
+    data = path.read_bytes()
+    head, found, _ = data[:MAX_HEADER_BYTES].partition(b"end_header")
     if not head.startswith(b"ply"):
         raise _wrong_file(path, head, "it is not a .ply file")
     if found and b" packed_position" in head:
-        return LoadedAsset(_read_compressed(path), "-Y", _note(b"element sh " in head))
-    if found and b" f_dc_0" not in head:
+        return _loaded(path, _read_compressed(data, path), "-Y", _note(b"element sh " in head))
+    if found and b" f_dc_0" not in head and b" scale_0" not in head:
         what = "a polygon mesh" if b"element face" in head else "a plain point cloud"
         raise InputError(
             f"{path}: it is {what}, not Gaussians (f_dc_0 is missing); import it with File > Import > Stanford PLY."
         )
-    asset = read_ply(path)
+    asset, left_out = sound_asset_from_bytes(data, path)
     ours = b"comment timesplat " in head or b" scale_t" in head
-    return LoadedAsset(asset, "Z" if ours else "-Y", _note(b" f_rest_0" in head))
+    said = re.search(rb"(?i)comment vertical axis: *([yz])\b", head)  # by nerfstudio
+    up = "Z" if ours else said[1].decode().upper() if said else "-Y"
+    return LoadedAsset(asset, up, " ".join(filter(None, (left_out, _note(b" f_rest_0" in head)))))
 
 
-def _read_compressed(path: Path) -> Asset:
-    """Chunks of 256 Gaussians, quantised between the chunk's bounds."""
+def _loaded(path: Path, asset: Asset, up: str, note: str = "") -> LoadedAsset:
+    asset, left_out = sound_part(asset, path)
+    return LoadedAsset(asset, up, " ".join(filter(None, (left_out, note))))
+
+
+def _read_compressed(data: bytes, path: Path) -> Asset:
+    """Chunks of 256 Gaussians, quantised between the chunk's bounds; unchecked."""
     try:
-        tables = _ply_tables(path.read_bytes())
-        chunk, rows = tables["chunk"], tables["vertex"]
+        tables = PlyTables(data, path)
+        chunk, rows = tables.table("chunk"), tables.table("vertex")
         if len(chunk) != -(-len(rows) // 256):
             raise ValueError(f"{len(chunk)} chunks do not belong to {len(rows)} Gaussians")
 
@@ -119,9 +137,8 @@ def _read_compressed(path: Path) -> Asset:
         if "min_r" in chunk.dtype.names:
             rgb = between(("r", "g", "b"), rgb)
         largest, *others = unpacked("packed_rotation", 2, 10, 10, 10)
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by `check`
-            return static_asset(
-                path,
+        with np.errstate(over="ignore", invalid="ignore"):
+            return unchecked_static_asset(
                 xyz=between(("x", "y", "z"), np.stack(unpacked("packed_position", 11, 10, 11), 1)),
                 scale=np.exp(between(SCALE_BOUNDS, np.stack(unpacked("packed_scale", 11, 10, 11), 1))),
                 rotation=_with_largest(np.round(largest * 3), (np.stack(others, 1) - 0.5) * np.sqrt(2)),
@@ -132,25 +149,6 @@ def _read_compressed(path: Path) -> Asset:
         raise
     except (ValueError, KeyError, IndexError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: the compressed .ply is truncated or damaged ({e}); export it again.") from None
-
-
-def _ply_tables(data: bytes) -> dict[str, np.ndarray]:
-    """Every element of a binary little-endian .ply without lists as a record array."""
-    types = {"float": "<f4", "uint": "<u4", "uchar": "u1", "float32": "<f4", "uint32": "<u4", "uint8": "u1"}
-    head, _, _ = data.partition(b"end_header")
-    tables, at = {}, data.index(b"\n", len(head)) + 1 if b"\n" in data[len(head) :] else len(data)
-    if b"format binary_little_endian" not in head:
-        raise ValueError("it is not binary, little-endian")
-    for element in head.decode("ascii", "replace").split("\nelement ")[1:]:
-        first, *lines = element.splitlines()
-        name, count = first.split()
-        if int(count) < 0:
-            raise ValueError(f"{count} of {name}")
-        words = [line.split() for line in lines if line.startswith("property")]
-        dtype = np.dtype([(w[2], types[w[1]]) for w in words])
-        tables[name] = np.frombuffer(data, dtype, int(count), at)
-        at += int(count) * dtype.itemsize
-    return tables
 
 
 # ---------------------------------------------------------------- .splat
@@ -169,11 +167,12 @@ def read_splat(path: Path) -> LoadedAsset:
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 0.1
     with np.errstate(invalid="ignore"):
         sane = (np.abs(xyz) < 1e9).all(1) & (scale >= 0).all(1) & (scale < 1e9).all(1)
-    if not sane.all() or unit.mean() < 0.9:
+    if min(sane.mean(), unit.mean()) < 0.9:
         wrong = (~(sane & unit)).sum()
         raise _wrong_file(path, data, f"it is damaged or not a .splat ({wrong} of {len(rows)} Gaussians make no sense)")
     rgb, opacity = (rows[name].astype(np.float32) / 255 for name in ("rgb", "opacity"))
-    return LoadedAsset(static_asset(path, xyz, np.maximum(scale, 1e-9), rotation, rgb, opacity), "-Y")
+    xyz = np.where(sane[:, None], xyz, np.nan)
+    return _loaded(path, unchecked_static_asset(xyz, np.maximum(scale, SMALLEST_SCALE), rotation, rgb, opacity), "-Y")
 
 
 # ---------------------------------------------------------------- .spz
@@ -251,15 +250,14 @@ def _spz(path: Path, head: bytes, section: Callable[[int, int], bytes]) -> Loade
             raise EOFError(f"{n} Gaussians were announced, and there are fewer")
         parts.append(np.frombuffer(data, np.uint8).reshape(n, width))
     xyz, alpha, colour, scale, turn = parts
-    asset = static_asset(
-        path,
+    asset = unchecked_static_asset(
         xyz=xyz.view("<f2").astype(np.float32) if version == 1 else np.ldexp(_signed_24_bits(xyz), -fraction),
         scale=np.exp(scale.astype(np.float32) / 16 - 10),
         rotation=wxyz_from_xyzw(_spz_rotation(turn, version)),
         rgb=0.5 + SH_C0 / 0.15 * (colour.astype(np.float32) / 255 - 0.5),
         opacity=alpha.squeeze(1).astype(np.float32) / 255,
     )
-    return LoadedAsset(asset, "Y", _note(degree > 0))
+    return _loaded(path, asset, "Y", _note(degree > 0))
 
 
 def _signed_24_bits(data: np.ndarray) -> np.ndarray:

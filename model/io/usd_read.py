@@ -16,15 +16,20 @@ from .asset import (
     MAX_GAUSSIANS,
     ONE_FRAME_SIGMA,
     SH_C0,
+    SMALLEST_SCALE,
     STATIC_SIGMA_T,
     Asset,
     Clip,
+    LoadedAsset,
     check,
+    sound_part,
+    srgb_from_linear,
     wxyz_from_xyzw,
 )
 from .paths import Paths, continuous
 from .placement import place_asset, rest_and_motion
 from .usd_stage import (
+    DISPLAY_COLOUR,
     RECONSTRUCTION,
     SH_COEFFICIENTS,
     SPLAT_TYPE,
@@ -38,16 +43,18 @@ from .usd_stage import (
 
 
 def read_usd(path: str | Path) -> Asset:
-    """`read_usd_with_motion` without the motion: where it moves as a whole the asset stands where that starts."""
-    return read_usd_with_motion(path)[0]
+    """`load_usd` without the motion: where it moves as a whole the asset stands where that starts."""
+    return load_usd(path).asset
 
 
-def read_usd_with_motion(path: str | Path) -> tuple[Asset, np.ndarray | None]:
+def load_usd(path: str | Path) -> LoadedAsset:
     """The asset in a file that `write_usd` wrote (any mode), or in a stage that references one: its transforms,
     upAxis, metersPerUnit and retiming are applied, and the asset's clip leads to metres, Z up. Failing that,
     the splats of another program, without what depends on the direction; where they change over time, as
-    Gaussians that live for one frame each. And where its prim or what is above it moves over time, that motion:
-    (F,4,4) for each frame of the clip, in the world, from where the clip places the asset (see `rest_and_motion`).
+    Gaussians that live for one frame each, or until the next sample where frames have several. What they leave out is
+    what the schema says; without coefficients displayColor counts. And where its prim or what is above it moves over
+    time, that motion: (F,4,4) for each frame of the clip, in the world, from where the clip places the asset (see
+    `rest_and_motion`).
 
     Raises InputError: no such file, not USD, no splats or several of them, a transform that is flat, arrays that
     do not belong together."""
@@ -56,7 +63,7 @@ def read_usd_with_motion(path: str | Path) -> tuple[Asset, np.ndarray | None]:
         return _read(path)
 
 
-def _read(path: Path) -> tuple[Asset, np.ndarray | None]:
+def _read(path: Path) -> LoadedAsset:
     stage = open_stage(path)
     select(stage, RECONSTRUCTION)
     found = [p for p in all_prims(stage) if p.HasAttribute("primvars:gs4d:mu_t")]
@@ -70,20 +77,33 @@ def _read(path: Path) -> tuple[Asset, np.ndarray | None]:
     if len(found) > 1:
         names = ", ".join(str(p.GetPath()) for p in found[:3]) + (", …" if len(found) > 3 else "")
         raise InputError(f"{path}: it holds {len(found)} assets ({names}); open one of their own files.")
-    asset = _read_4d(path, stage, found[0]) if ours else _read_others(path, stage, found[0])
-    check(asset, path)
-    return _in_the_world(asset, path, stage, found[0])
+    note = ""
+    if ours:
+        asset = _read_4d(path, stage, found[0])
+        check(asset, path)
+    else:
+        asset, note = sound_part(_read_others(path, stage, found[0]), path)
+    placed, motion = _in_the_world(asset, path, stage, found[0])
+    return LoadedAsset(placed, "Z", note, motion)
 
 
 def _values(path: Path, prim, *names: str, code=None, dtype: type = np.float32) -> np.ndarray:
     """The first of the attributes that has a value, at a time code or else at the first one."""
+    value = _value(prim, *names, code=code)
+    if value is None:
+        raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
+    return value.astype(dtype)
+
+
+def _value(prim, *names: str, code=None) -> np.ndarray | None:
+    """The same in the type it has, or None."""
     for name in names:
         attribute = prim.GetAttribute(name)
         at = import_pxr().Usd.TimeCode.EarliestTime() if code is None else code
         value = attribute.Get(at) if attribute else None
         if value is not None:
-            return np.asarray(value).astype(dtype)
-    raise InputError(f"{path}: {names[0]} is missing at {prim.GetPath()}; export it again.")
+            return np.asarray(value)
+    return None
 
 
 def _clip(path: Path, stage, start: float, end: float, pixel: float = 0.0) -> Clip:
@@ -143,8 +163,10 @@ def _tracks(path: Path, prim) -> dict[str, Any]:
 
 
 def _unit(quaternion: np.ndarray) -> np.ndarray:
-    with np.errstate(all="ignore"):  # `check` names what is damaged
-        return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    """Of quaternions w x y z, of which zero ones do not turn."""
+    with np.errstate(all="ignore"):  # what is NaN stays so
+        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        return np.where(length == 0, np.array([1, 0, 0, 0], np.float32), quaternion / length)
 
 
 def _rgb(sh: np.ndarray) -> np.ndarray:
@@ -153,36 +175,58 @@ def _rgb(sh: np.ndarray) -> np.ndarray:
 
 
 def _read_others(path: Path, stage, prim) -> Asset:
-    """A prim of another program's, in its own space."""
+    """A prim of another program's, in its own space; unchecked."""
     names = ("positions", "scales", "orientations", "opacities", SH_COEFFICIENTS)
-    attributes = [prim.GetAttribute(k) for n in names for k in (n, f"{n}h")]
+    attributes = [prim.GetAttribute(k) for n in (*names, DISPLAY_COLOUR) for k in (n, f"{n}h")]
     codes = sorted({c for a in attributes if a for c in a.GetTimeSamples()})
     clip = _clip(path, stage, codes[0], codes[-1]) if len(codes) > 1 else Clip(stage.GetTimeCodesPerSecond(), 0, 0)
     first, last = clip.frame_start, clip.frame_end
-    sigma_t = ONE_FRAME_SIGMA * 2 / (last - first) if last > first else STATIC_SIGMA_T
+    moments, sigma_t = np.array([float(first)]), np.array([STATIC_SIGMA_T])
+    if last > first:
+        moments = np.union1d(clip.frames, [c for c in codes if c % 1])
+        gaps = np.diff(moments, prepend=-np.inf, append=np.inf)
+        sigma_t = ONE_FRAME_SIGMA * np.minimum(gaps[1:], gaps[:-1]) * 2 / (last - first)
     parts, total = [], 0
-    for frame in clip.frames:
-        code = frame if len(codes) > 1 else codes[0] if codes else None
-        xyz, scale, quaternion, opacity, sh = (_values(path, prim, n, f"{n}h", code=code) for n in names)
+    for moment, sigma in zip(moments.tolist(), sigma_t, strict=True):
+        code = moment if len(codes) > 1 else codes[0] if codes else None
+        xyz = _values(path, prim, "positions", "positionsh", code=code)
         n = len(xyz)
         total += n
         if total > MAX_GAUSSIANS:
             raise InputError(
                 f"{path}: it has more than {MAX_GAUSSIANS:,} Gaussians over its frames; export fewer frames."
             )
-        if n == 0 or len(sh) == 0 or len(sh) % n or quaternion.ndim != 2:
-            raise InputError(f"{path}: {len(sh)} SH coefficients cannot belong to {n} splats; export it again.")
+        scale, quaternion, opacity = (_value(prim, k, f"{k}h", code=code) for k in names[1:4])
+        if quaternion is not None and quaternion.ndim != 2:
+            raise InputError(f"{path}: {quaternion.size} orientations cannot belong to {n} splats; export it again.")
         parts.append({
             "xyz": xyz,
-            "t": np.full(n, clip.frame_to_time(frame), np.float32),
+            "t": np.full(n, clip.frame_to_time(moment)),
             "velocity": np.zeros_like(xyz),
-            "sigma_t": np.full(n, sigma_t, np.float32),
-            "scale": np.maximum(scale, np.float32(1e-9)),
-            "rotation": wxyz_from_xyzw(_unit(quaternion)),
-            "rgb": _rgb(sh[:: len(sh) // n]),
-            "opacity": opacity,
+            "sigma_t": np.full(n, sigma),
+            "scale": np.ones((n, 3)) if scale is None else np.maximum(scale, SMALLEST_SCALE),
+            "rotation": np.tile([1.0, 0, 0, 0], (n, 1)) if quaternion is None else _unit(wxyz_from_xyzw(quaternion)),
+            "rgb": _colours(path, prim, n, code),
+            "opacity": np.ones(n) if opacity is None else opacity,
         })  # fmt: skip
-    return Asset(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]}, clip=clip)
+    joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+    return Asset(**{k: a.astype(np.float32) for k, a in joined.items()}, clip=clip)
+
+
+def _colours(path: Path, prim, n: int, code) -> np.ndarray:
+    """(N,3) sRGB-encoded: of the coefficients, else of displayColor, else grey."""
+    sh = _value(prim, SH_COEFFICIENTS, f"{SH_COEFFICIENTS}h", code=code)
+    if sh is not None:
+        if n == 0 or len(sh) == 0 or len(sh) % n:
+            raise InputError(f"{path}: {len(sh)} SH coefficients cannot belong to {n} splats; export it again.")
+        return _rgb(sh[:: len(sh) // n])
+    UsdGeom, TimeCode = import_pxr().UsdGeom, import_pxr().Usd.TimeCode
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(DISPLAY_COLOUR.removeprefix("primvars:"))
+    shown = primvar.ComputeFlattened(TimeCode.EarliestTime() if code is None else code) if primvar else None
+    colours = np.full((1, 3), 0.5) if shown is None else srgb_from_linear(np.asarray(shown).reshape(-1, 3))
+    if len(colours) not in (1, n):
+        raise InputError(f"{path}: {len(colours)} colours cannot belong to {n} splats; export it again.")
+    return np.broadcast_to(colours, (n, 3))
 
 
 def _in_the_world(asset: Asset, path: Path, stage, prim) -> tuple[Asset, np.ndarray | None]:

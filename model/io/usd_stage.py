@@ -20,6 +20,7 @@ ROOT_PATH = "/timesplat"
 SPLATS_PATH = f"{ROOT_PATH}/splats"
 SPLAT_TYPE = "ParticleField3DGaussianSplat"
 SH_COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
+DISPLAY_COLOUR = "primvars:displayColor"
 VARIANT_SET = "representation"  # of files that hold the original object too
 RECONSTRUCTION, ORIGINAL = "reconstruction", "original"  # its variants
 

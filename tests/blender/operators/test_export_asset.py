@@ -259,7 +259,8 @@ tell(done=done, want=want, got=got, said=said, keyed=bool(bpy.context.object.ani
     asset = read_ply(folder / "in.ply")
     for name in ("a.usdz", "b.usda", "c.usdc", "again.usdc"):
         assert usd_check.check_usd(folder / name) == []
-        got, motion = usd_read.read_usd_with_motion(folder / name)
+        loaded = usd_read.load_usd(folder / name)
+        got, motion = loaded.asset, loaded.motion
         for frame, (points, matrix) in told["want"].items():
             xyz, opacity = got.at(got.frame_to_time(int(frame)))
             xyz = (xyz * got.clip.scale + got.clip.translation)[opacity >= VISIBLE]

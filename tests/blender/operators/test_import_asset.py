@@ -10,7 +10,7 @@ import pytest
 
 from timesplat.model.io import slices
 from timesplat.model.io.asset import ARRAYS, VISIBLE
-from timesplat.model.io.ply import read_ply, write_ply
+from timesplat.model.io.ply import columns_3dgs, ply_bytes, read_ply, write_ply
 
 from ..helpers import make
 
@@ -67,6 +67,19 @@ def test_other_programs_files_stand_upright(blender, tmp_path):
     assert np.abs(got[:, None] - world[None]).max(2).min(1).max() < 2e-5  # in another order
     np.testing.assert_allclose(told["spz"][1], [[1, -3, 2]], atol=1e-6)  # Y is up, and +Z comes to the front, -Y
     np.testing.assert_allclose(told["z"][1], [[1, 2, 3]], atol=1e-6)
+
+
+def test_what_is_far_away_is_turned_about_the_origin_of_the_world(blender, tmp_path):
+    asset, at = make(60), np.array([3000.0, 4000.0, 5000.0])  # of the slice, -Y up
+    part = slices.slice_at(asset, 12)
+    part.xyz[:] = part.xyz / 100 + at
+    part.xyz[7] = np.nan
+    columns = columns_3dgs(part)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(columns, []))
+    told = blender(IMPORT + "tell(**load(filepath=sys.argv[1]), seen=seen(5))", tmp_path / "a.ply")
+    assert told["done"] == ["FINISHED"]
+    world = np.delete(part.xyz, 7, 0)[:, [0, 2, 1]] * [1, 1, -1]
+    np.testing.assert_allclose(told["seen"], world, atol=2e-3)
 
 
 def test_several_files_or_a_folder_are_a_sequence(blender, tmp_path):
@@ -206,5 +219,8 @@ def test_menu_and_drop(blender):
     told = blender(code)
     module = "timesplat.addon.operators.import_asset"
     assert module in told["there"] and module not in told["gone"]
-    assert told["suffixes"] == ".ply;.splat;.spz;.usd;.usdc;.usda;.usdz" and told["target"] == "timesplat.import_asset"
+    assert (
+        told["suffixes"] == ".ply;.splat;.spz;.html;.usd;.usdc;.usda;.usdz"
+        and told["target"] == "timesplat.import_asset"
+    )
     assert {"filepath", "directory", "files"} <= set(told["operator"]) and not told["handler"]

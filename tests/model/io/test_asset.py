@@ -13,13 +13,17 @@ from timesplat.model.io.asset import (
     MAX_FRAME_NUMBER,
     Clip,
     check,
+    linear_from_srgb,
+    near_origin,
+    sound_part,
+    srgb_from_linear,
     static_asset,
     wxyz_from_xyzw,
     xyzw_from_wxyz,
 )
 from timesplat.model.io.ply import write_ply
 
-from ...assets import make_asset
+from ...assets import assert_same, make_asset, tracked_asset
 
 
 def test_at_is_the_kinematic_form():
@@ -95,3 +99,54 @@ def test_a_static_asset_is_the_same_at_all_times():
 def test_the_orders_of_quaternions_are_each_others_inverse():
     q = np.array([["w", "x", "y", "z"]])
     assert "".join(xyzw_from_wxyz(q)[0]) == "xyzw" and "".join(wxyz_from_xyzw(xyzw_from_wxyz(q))[0]) == "wxyz"
+
+
+# ---------------------------------------------------------------- what others wrote
+
+
+@pytest.mark.parametrize("asset", [make_asset(9), tracked_asset(9)], ids=["lines", "paths"])
+def test_what_is_no_number_is_left_out_and_named(asset):
+    whole, note = sound_part(asset[np.arange(9)], "a.ply")
+    assert note == "" and len(whole) == 9
+    damaged = asset[np.arange(9)]
+    damaged.xyz[2, 1], damaged.opacity[2], damaged.opacity[5] = np.nan, np.inf, np.nan
+    rest, note = sound_part(damaged, "a.ply")
+    assert note == "2 of 9 Gaussians are left out: NaN, or beyond all bounds, in position and opacity."
+    assert_same(asset[np.delete(np.arange(9), [2, 5])], rest, 0, 0)
+    damaged.rgb[:] = np.inf
+    with pytest.raises(InputError, match=r"a\.ply: position and colour and opacity of all its 9 Gaussians holds NaN"):
+        sound_part(damaged, "a.ply")
+    with pytest.raises(InputError, match="it holds no Gaussians"):
+        sound_part(asset[np.arange(0)], "a.ply")
+
+
+def test_opacities_are_clamped_and_more_than_rounding_is_said():
+    asset = make_asset(3)
+    asset.opacity[:] = 1.0001, -1e-5, 0.5
+    part, note = sound_part(asset, "a.ply")
+    assert note == "" and part.opacity.tolist() == [1, 0, 0.5]
+    asset.opacity[:] = 200, -1, 0.5
+    part, note = sound_part(asset, "a.ply")
+    assert note == "The opacities of 2 Gaussians are clamped to 0..1." and part.opacity.tolist() == [1, 0, 0.5]
+
+
+def test_what_is_far_from_the_origin_is_counted_from_its_middle():
+    near = np.random.default_rng(0).uniform(-1, 1, (99, 3))
+    for middle in ((0, 0, 0), (100, -50, 3)):
+        xyz, at = near_origin(near + middle)
+        assert at == (0, 0, 0) and (xyz == near + middle).all()
+        assert near_origin(near[:1] + middle)[1] == (0, 0, 0)  # of one alone, which has no size
+    far = near + np.array([448_262.3, 5_411_932.7, 217.0])
+    far[3], far[50] = np.nan, (0, 0, 0)  # neither damage nor strays move the middle
+    xyz, at = near_origin(far)
+    np.testing.assert_allclose(at, (448_262.3, 5_411_932.7, 217.0), atol=1)
+    np.testing.assert_allclose(xyz.astype(np.float32).astype(float) + at, far, atol=1e-6 * 5.5e6 / 5)
+    rows = np.delete(np.arange(99), [3, 50])
+    np.testing.assert_allclose(xyz[rows].astype(np.float32) + at, far[rows], atol=1e-6)
+    assert near_origin(np.full((2, 3), np.nan))[1] == (0, 0, 0)
+
+
+def test_encodings_undo_one_another():
+    x = np.linspace(0, 1, 999, dtype=np.float32)
+    np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(x)), x, atol=1e-6)
+    assert srgb_from_linear(np.array([-1, 2])).tolist() == [0, 1]

@@ -14,10 +14,10 @@ import pytest
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.io import files
-from timesplat.model.io.asset import STATIC_SIGMA_T, VISIBLE, Clip, LoadedAsset
-from timesplat.model.io.files import READABLE, WRITABLE, frame_files, read_asset, read_frames, write_asset
+from timesplat.model.io.asset import STATIC_SIGMA_T, VISIBLE, Clip, LoadedAsset, rotation_matrices
+from timesplat.model.io.files import READABLE, WRITABLE, frame_files, read_asset, read_frames, upright, write_asset
 from timesplat.model.io.pieces import to_pieces
-from timesplat.model.io.ply import write_ply
+from timesplat.model.io.ply import PROPERTIES_3DGS, columns_3dgs, write_ply
 from timesplat.model.io.slices import SLICE_FORMATS, write_slice
 from timesplat.model.io.usd_stage import USD_SUFFIXES
 
@@ -73,6 +73,42 @@ def test_what_is_no_sequence_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MAX_GAUSSIANS", 9)
     with pytest.raises(InputError, match=r"b\.ply: with it the sequence has more than 9"):
         read_frames([tmp_path / "a.ply", tmp_path / "b.ply"])
+
+
+@pytest.mark.parametrize(("up", "turn"), [("Y", (0, -2, 1)), ("-Y", (0, 2, -1)), ("Z", (0, 1, 2))])
+@pytest.mark.parametrize("kind", [make_asset, tracked_asset])
+def test_what_is_up_in_a_file_is_up_at_last(up, turn, kind):
+    """World positions are turned (`turn`: where x, y, z come from, with their signs), and covariances with them."""
+    asset = kind(40)
+    standing = upright(LoadedAsset(asset, up))
+    assert_same(standing, upright(LoadedAsset(asset, "Y" if up == "Z" else "Z"), up), 0, 0)
+    for frame in (10, 21.5, 33):
+        time, worlds = asset.frame_to_time(frame), []
+        for one in (asset, standing):
+            R = rotation_matrices(one.rotation_at(time)) * (one.scale * np.float32(one.clip.scale))[:, None, :]
+            worlds.append((one.at(time)[0] * one.clip.scale + one.clip.translation, R @ R.transpose(0, 2, 1)))
+        rows, signs = np.abs(turn), np.array([1, *(1 if t >= 0 else -1 for t in turn[1:])])
+        (xyz, covariance), (turned, turned_covariance) = worlds
+        np.testing.assert_allclose(turned, xyz[:, rows] * signs, atol=1e-5)
+        expected = covariance[:, rows][:, :, rows] * np.outer(signs, signs)
+        np.testing.assert_allclose(turned_covariance, expected, atol=1e-6)
+
+
+def test_files_of_a_sequence_far_from_the_origin_stay_where_they_are(tmp_path):
+    """Each is read as from its own middle."""
+    at = [np.array([5e6 + 3 * k, -2e5, 10.0]) for k in range(3)]
+    parts = [make_asset(n, seed=n) for n in (5, 9, 7)]
+    for k, (part, middle) in enumerate(zip(parts, at, strict=True)):
+        kinds = [(n, "<f8" if n in "xyz" else "<f4") for n in PROPERTIES_3DGS]
+        columns = columns_3dgs(part) | dict(zip("xyz", (part.xyz + middle).T, strict=True))
+        rows = np.rec.fromarrays([columns[n] for n, _ in kinds], kinds)
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+        head += [f"property {'double' if n in 'xyz' else 'float'} {n}" for n, _ in kinds]
+        (tmp_path / f"f_{k}.ply").write_bytes("\n".join([*head, "end_header", ""]).encode() + rows.tobytes())
+    asset = read_asset(tmp_path).asset
+    world = asset.xyz.astype(float) + asset.clip.translation
+    expected = np.concatenate([part.xyz + middle for part, middle in zip(parts, at, strict=True)])
+    np.testing.assert_allclose(world, expected, atol=2e-6)
 
 
 # ---------------------------------------------------------------- one file
@@ -145,7 +181,7 @@ def test_options_go_to_the_writer(tmp_path):
         (read_asset, "its name must end in .ply, .splat, .spz, .html, .usd, .usdc, .usda, .usdz; choose one of these."),
         (
             lambda path: write_asset(path, make_asset()),
-            "that; choose .ply, .html, .usd, .usdc, .usda, .usdz.",
+            "cannot write that; choose .ply, .html, .usd, .usdc, .usda, .usdz.",
         ),
         (lambda path: write_asset(path, make_asset(), frame=3), "the name of a slice must end in .ply or .splat;"),
     ],

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from timesplat.datagen.sequence import InputError
 from timesplat.model.io.asset import SH_C0, Asset, Clip, check
-from timesplat.model.io.ply import read_ply, write_ply
+from timesplat.model.io.ply import columns_3dgs, read_ply, write_ply
 
 from ...assets import assert_same, make_asset
 
@@ -122,6 +122,54 @@ def test_plain_3dgs_is_static(tmp_path, order):
     assert a.clip == Clip()
 
 
+def columns_ply(columns, kinds=None) -> bytes:
+    """A plain .ply of (N,) columns, floats unless `kinds` says otherwise."""
+    kinds = kinds or {}
+    rows = np.rec.fromarrays(list(columns.values()), [(name, kinds.get(name, "<f4")) for name in columns])
+    types = {"<f4": "float", "<f8": "double", "u1": "uchar"}
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    head += [f"property {types[kinds.get(name, '<f4')]} {name}" for name in columns]
+    return "\n".join([*head, "end_header", ""]).encode() + rows.tobytes()
+
+
+def test_discs_are_flat_gaussians(tmp_path):
+    """2DGS has two scales; the third axis is the disc's normal."""
+    a = make_asset(9)
+    columns = columns_3dgs(a)
+    del columns["scale_2"]
+    (tmp_path / "a.ply").write_bytes(columns_ply(columns))
+    got = read_ply(tmp_path / "a.ply")
+    np.testing.assert_allclose(got.scale[:, :2], a.scale[:, :2], rtol=1e-5)
+    np.testing.assert_allclose(got.scale[:, 2], 1e-3 * a.scale[:, :2].min(1), rtol=1e-5)
+    np.testing.assert_allclose(got.rotation, a.rotation, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["u1", "<f4"])
+def test_plain_colours_are_colours(tmp_path, kind):
+    a = make_asset(9)
+    columns = {k: x for k, x in columns_3dgs(a).items() if not k.startswith("f_dc_")}
+    rgb = np.round(a.rgb * 255) if kind == "u1" else a.rgb
+    columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
+    (tmp_path / "a.ply").write_bytes(columns_ply(columns, dict.fromkeys(("red", "green", "blue"), kind)))
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply").rgb, a.rgb, atol=0.51 / 255 if kind == "u1" else 1e-6)
+
+
+def test_coordinates_of_maps_go_into_the_translation(tmp_path):
+    a, at = make_asset(300), np.array([448_262.25, 5_411_932.5, 217.0])
+    columns = columns_3dgs(a) | dict(zip("xyz", (a.xyz + at).T, strict=True))
+    (tmp_path / "a.ply").write_bytes(columns_ply(columns, dict.fromkeys("xyz", "<f8")))
+    got = read_ply(tmp_path / "a.ply")
+    np.testing.assert_allclose(got.clip.translation, at, atol=1)
+    np.testing.assert_allclose(got.xyz.astype(float) + got.clip.translation, a.xyz + at, atol=1e-6)
+
+
+def test_zero_scales_of_others_are_as_small_as_can_be(tmp_path):
+    columns = columns_3dgs(make_asset(2))
+    columns["scale_1"] = np.array([-3, -500.0])
+    (tmp_path / "a.ply").write_bytes(columns_ply(columns))
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply").scale[:, 1], [np.exp(-3), 1e-9], rtol=1e-6)
+
+
 def test_files_without_the_pixel_comment_are_read(tmp_path):
     write_ply(tmp_path / "a.ply", make_asset(3, clip=CLIP))
     data = (tmp_path / "a.ply").read_bytes()
@@ -152,7 +200,8 @@ def test_truncation_anywhere_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (b"binary_little_endian", b"ascii", ("ascii", "convert")),
+        (b"binary_little_endian", b"ascii", ("its element vertex holds what is no number",)),
+        (b"binary_little_endian", b"binary_middle_endian", ("header",)),
         (b"ply\n", b"PK\x03\x04", ("not a .ply",)),
         (b"element vertex", b"element chunk", ("chunk", "uncompressed")),
         (b"element vertex 3", b"element vertex three", ("header",)),

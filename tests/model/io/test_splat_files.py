@@ -173,6 +173,53 @@ def test_ply_tells_whose_it_is_and_what_is_left_out(tmp_path):
     assert plain.up == "-Y" and "spherical harmonics" in plain.note
 
 
+@pytest.mark.parametrize(("says", "up"), [("z", "Z"), ("Y", "Y"), ("sideways", "-Y")])
+def test_a_ply_may_say_what_is_up(tmp_path, says, up):
+    (tmp_path / "a.ply").write_bytes(PLAIN.replace(b"element", f"comment Vertical Axis: {says}\nelement".encode(), 1))
+    assert read_asset(tmp_path / "a.ply").up == up
+
+
+def plain(rows: np.ndarray) -> bytes:
+    return PLAIN.replace(b"vertex 1", f"vertex {len(rows)}".encode())[:-72] + rows.astype("<f4").tobytes()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [("x", "position"), ("f_dc_1", "colour"), ("opacity", "opacity"), ("scale_0", "scale"), ("rot_2", "rotation")],
+)
+def test_gaussians_that_are_no_numbers_are_left_out_of_a_ply(tmp_path, name, word, value):
+    rows = np.random.default_rng(0).normal(size=(9, 18))
+    rows[4, NAMES.split().index(name)] = value
+    (tmp_path / "a.ply").write_bytes(plain(rows))
+    loaded = read_asset(tmp_path / "a.ply")
+    if (name == "opacity" and np.isinf(value)) or (name == "scale_0" and value == -np.inf):  # a logit, a logarithm
+        assert len(loaded.asset) == 9 and "left out:" not in loaded.note
+        assert name != "opacity" or loaded.asset.opacity[4] == (value > 0)
+        return
+    np.testing.assert_array_equal(loaded.asset.xyz, np.delete(rows, 4, 0)[:, :3].astype(np.float32))
+    assert loaded.note.startswith(f"1 of 9 Gaussians are left out: NaN, or beyond all bounds, in {word}.")
+    assert "spherical harmonics" in loaded.note
+
+
+def test_gaussians_that_are_no_numbers_are_left_out_of_a_splat(tmp_path):
+    data, asset = splat(20)
+    data = bytearray(data)
+    data[32 * 7 : 32 * 7 + 4] = struct.pack("<f", math.nan)
+    (tmp_path / "a.splat").write_bytes(data)
+    loaded = read_asset(tmp_path / "a.splat")
+    np.testing.assert_array_equal(loaded.asset.xyz, np.delete(asset.xyz, 7, 0))
+    assert loaded.note == "1 of 20 Gaussians are left out: NaN, or beyond all bounds, in position."
+
+
+def test_a_zero_quaternion_does_not_turn(tmp_path):
+    rows = np.random.default_rng(0).normal(size=(9, 18))
+    rows[4, -4:] = 0
+    (tmp_path / "a.ply").write_bytes(plain(rows))
+    loaded = read_asset(tmp_path / "a.ply")
+    assert loaded.asset.rotation[4].tolist() == [1, 0, 0, 0] and "left out:" not in loaded.note
+
+
 # ---------------------------------------------------------------- what is something else
 
 
@@ -205,7 +252,7 @@ def ours(**values) -> bytes:
         ("a.ply", CLOUD, "it is a plain point cloud, not Gaussians"),
         ("a.ply", b"", "it is not a .ply file"),
         ("a.ply", compressed()[:-1], "truncated"),
-        ("a.ply", compressed(count=300), "truncated or damaged"),
+        ("a.ply", compressed(count=300), "truncated, 300 Gaussians were announced"),
         ("a.ply", compressed(chunks=0, data=COMPRESSED[72:]), "0 chunks do not belong to 3"),
         ("a.ply", compressed(count=-1), "damaged"),
         ("a.ply", compressed(COMPRESSED[:24] + b"\0\0\xc0\x7f" + COMPRESSED[28:]), "holds NaN"),

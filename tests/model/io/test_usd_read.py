@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pxr")
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from timesplat.datagen.sequence import InputError
-from timesplat.model.io.asset import rotation_matrices
-from timesplat.model.io.usd_read import read_usd, read_usd_with_motion
-from timesplat.model.io.usd_stage import SPLAT_TYPE
+from timesplat.model.io.asset import rotation_matrices, srgb_from_linear
+from timesplat.model.io.usd_read import load_usd, read_usd
+from timesplat.model.io.usd_stage import SH_COEFFICIENTS, SPLAT_TYPE
 from timesplat.model.io.usd_write import write_usd
 
 from ...assets import assert_same, make_asset, tracked_asset
@@ -89,13 +89,68 @@ def test_moving_splats_of_another_program_live_for_a_frame_each(tmp_path):
         np.testing.assert_allclose(opacity[seen], [0.5, 0.75, 1], atol=1e-6)
 
 
+def test_what_other_programs_leave_out_is_as_the_schema_says(tmp_path):
+    whole, bare = tmp_path / "whole.usda", tmp_path / "bare.usda"
+    write_foreign(whole)
+    write_foreign(bare, scales=1, orientations=1, opacities=1, **{SH_COEFFICIENTS: 1})
+    stage = Usd.Stage.Open(str(bare))
+    told = read_usd(bare)
+    np.testing.assert_array_equal(told.xyz, read_usd(whole).xyz)
+    np.testing.assert_allclose(told.scale * told.clip.scale, 0.1, rtol=1e-6)  # a unit is 10 cm
+    assert (told.opacity == 1).all() and (told.rgb == 0.5).all()
+    colours = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/scan")).CreatePrimvar(
+        "displayColor", Sdf.ValueTypeNames.Color3fArray
+    )
+    for given, interpolation in (([(0.1, 0.2, 0.9)] * 3, "vertex"), ([(0.1, 0.2, 0.9)], "constant")):
+        colours.Set(given)
+        colours.SetInterpolation(interpolation)
+        stage.Save()
+        np.testing.assert_allclose(read_usd(bare).rgb, srgb_from_linear(np.array([(0.1, 0.2, 0.9)] * 3)), atol=1e-6)
+
+
+def test_single_values_of_other_programs_do_not_refuse_the_file(tmp_path):
+    """A zero quaternion does not turn, a little more than opaque is opaque, what is no number is left out and named."""
+    write_foreign(tmp_path / "a.usda")
+    whole = read_usd(tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = stage.GetPrimAtPath("/scan")
+    prim.GetAttribute("orientations").Set([Gf.Quatf(0), Gf.Quatf(2), Gf.Quatf(1)])
+    prim.GetAttribute("opacities").Set([0.5, 1.0001, 1])
+    stage.Save()
+    loaded = load_usd(tmp_path / "a.usda")
+    np.testing.assert_allclose(loaded.asset.rotation, whole.rotation, atol=1e-6)
+    assert loaded.asset.opacity.tolist() == [0.5, 1, 1] and loaded.note == ""
+    prim.GetAttribute("opacities").Set([0.5, float("nan"), 7])
+    stage.Save()
+    loaded = load_usd(tmp_path / "a.usda")
+    assert loaded.asset.opacity.tolist() == [0.5, 1]
+    assert loaded.note == (
+        "1 of 3 Gaussians are left out: NaN, or beyond all bounds, in opacity. "
+        "The opacities of 1 Gaussians are clamped to 0..1."
+    )
+
+
+def test_samples_between_frames_are_kept(tmp_path):
+    at, _ = write_foreign(tmp_path / "a.usda", frames=(3, 3.5, 4, 5))
+    asset = read_usd(tmp_path / "a.usda")
+    assert len(asset) == 12 and asset.clip.frames == range(3, 6)
+    for frame, expected in at.items():
+        position, opacity = asset.at(asset.frame_to_time(frame))
+        x, y, z = expected.T * 0.1
+        world = position[opacity > 0.05] * asset.clip.scale + asset.clip.translation
+        np.testing.assert_allclose(world, np.stack([x, -z, y], 1), atol=1e-6)
+        np.testing.assert_allclose(opacity[opacity > 0.05], [0.5, 0.75, 1], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("edit", "word"),
     [
-        (lambda stage, prim: prim.RemoveProperty("opacities"), "opacities is missing at /scan"),
+        (lambda stage, prim: prim.RemoveProperty("positions"), "positions is missing at /scan"),
         (lambda stage, prim: prim.GetAttribute("positions").Set([(0, 0, 0)] * 5), "cannot belong to 5 splats"),
         (lambda stage, prim: prim.GetAttribute("positions").Set([]), "cannot belong to 0 splats"),
-        (lambda stage, prim: prim.GetAttribute("opacities").Set([2, 2, 2]), "opacity leaves the range"),
+        (lambda stage, prim: prim.GetAttribute("opacities").Set([float("nan")] * 3), "opacity of all its 3 Gaussians"),
+        (lambda stage, prim: prim.RemoveProperty(SH_COEFFICIENTS) and UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
+            "displayColor", Sdf.ValueTypeNames.Color3fArray).Set([(0, 0, 0)] * 2), "2 colours cannot belong to 3"),
         (lambda stage, prim: prim.GetAttribute("opacities").Set([1, 1]), "opacity is not a float32 array"),
         (lambda stage, prim: UsdGeom.Xformable(prim).AddScaleOp().Set((0, 1, 1)), "/scan is scaled to nothing"),
         (lambda stage, prim: UsdGeom.Xformable(prim).AddTranslateOp().Set((0, 1, 1), 3), None),
@@ -135,7 +190,8 @@ def test_splats_of_another_program_that_move_as_a_whole(tmp_path):
         shift.Set((f, 0, 0), 20 + f)
         size.Set((f / 4,) * 3, 20 + f)
     stage.Save()
-    asset, motion = read_usd_with_motion(tmp_path / "a.usda")
+    loaded = load_usd(tmp_path / "a.usda")
+    asset, motion = loaded.asset, loaded.motion
     assert asset.clip.frames == range(20, 25) and len(motion) == 5
     placed = np.c_[asset.xyz * asset.clip.scale + asset.clip.translation, np.ones(3)]
     for f in range(5):
@@ -145,7 +201,8 @@ def test_splats_of_another_program_that_move_as_a_whole(tmp_path):
         shift.Set((3, 0, 0), 20 + f)
         size.Set((1,) * 3, 20 + f)
     stage.Save()
-    asset, motion = read_usd_with_motion(tmp_path / "a.usda")
+    loaded = load_usd(tmp_path / "a.usda")
+    asset, motion = loaded.asset, loaded.motion
     x, y, z = (at[None] + [3, 0, 0]).T * 0.1
     np.testing.assert_allclose(
         asset.xyz * asset.clip.scale + asset.clip.translation, np.stack([x, -z, y], 1), atol=1e-6

@@ -22,7 +22,7 @@ from timesplat.model.io.asset import (
 )
 from timesplat.model.io.ply import write_ply
 from timesplat.model.io.usd_check import check_usd
-from timesplat.model.io.usd_read import read_usd, read_usd_with_motion
+from timesplat.model.io.usd_read import load_usd, read_usd
 from timesplat.model.io.usd_samples import MAX_STRAY
 from timesplat.model.io.usd_stage import SPLAT_TYPE, SPLATS_PATH
 from timesplat.model.io.usd_write import write_usd
@@ -289,7 +289,8 @@ def test_an_asset_that_moves_as_a_whole(tmp_path, suffix, mode):
         world = (np.c_[positions, np.ones(len(positions))] @ matrix.T)[opacity > 0.05, :3]
         assert ((world > low) & (world < high)).all()
     assert (high - low).max() < 25  # metres
-    back, again = read_usd_with_motion(path)
+    loaded = load_usd(path)
+    back, again = loaded.asset, loaded.motion
     np.testing.assert_allclose(back.clip.translation, (motion[0] @ own)[:3, 3])
     np.testing.assert_allclose(again, motion @ np.linalg.inv(motion[0]), atol=1e-9)
     assert read_usd(path).clip == back.clip
