@@ -211,7 +211,8 @@ def export_arguments(p: argparse.ArgumentParser) -> None:
         "out",
         type=Path,
         nargs="?",
-        help=".usdc, .usda, .usdz, .ply, .html (a page that plays it), .blend to write; .splat with --frame",
+        help=".usdc, .usda, .usdz, .ply, .html (a page that plays it), .blend to write; "
+        ".splat, .spz, .glb with --frame",
     )
     _up_argument(p)
     p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
@@ -222,7 +223,7 @@ def export_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--pieces", action="store_true", help="write straight 4D Gaussians in place of tracks, for readers "
                    "that know no paths")  # fmt: skip
     p.add_argument("--check", action="store_true", help="USD: exit with 1 if the validator complains")
-    p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply or .splat")
+    p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply, .splat, .spz or .glb")
     p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a 3DGS .ply a frame into a new folder")
 
 
@@ -232,6 +233,7 @@ def export(args: argparse.Namespace) -> int:
     import tempfile
 
     from .model.io.files import WRITABLE, write_asset
+    from .model.io.slice_formats import SLICE_FORMATS
     from .model.io.slices import write_slices
     from .model.io.usd_check import check_usd
     from .model.io.usd_stage import USD_SUFFIXES
@@ -243,7 +245,7 @@ def export(args: argparse.Namespace) -> int:
     if not usd and (args.mode != "splats" or args.half or args.original or args.check):
         raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
     if args.frame is not None and (usd or args.sequence):
-        raise InputError("export: --frame is for one .ply or .splat; drop it.")
+        raise InputError("export: --frame is for one moment's file, as .ply or .splat; drop it.")
     if args.pieces and (args.sequence or args.frame is not None):
         raise InputError("export: --pieces is for what has time, not for moments; drop it.")
     loaded = _read(args.asset, args.up)
@@ -258,6 +260,8 @@ def export(args: argparse.Namespace) -> int:
             ply = Path(folder) / f"{args.asset.stem}.ply"
             count = write_asset(ply, asset, pieces=args.pieces)
             save_blend(ply, args.out)
+    elif suffix not in WRITABLE and args.frame is None and suffix in SLICE_FORMATS:
+        raise InputError(f"{args.out}: {suffix} holds one moment; say which by --frame.")
     elif suffix not in WRITABLE and args.frame is None:
         raise InputError(f"{args.out}: cannot write that; choose {', '.join(WRITABLE)} or .blend.")
     else:

@@ -176,6 +176,13 @@ def test_what_is_left_out_is_said(tmp_path, capsys):
     assert "Gaussians are left out: NaN, or beyond all bounds, in position" in capsys.readouterr().out
 
 
+def test_files_of_one_moment_ask_which(tmp_path, capsys):
+    write_ply(tmp_path / "a.ply", make_asset(9))
+    for name in ("a.splat", "a.spz", "a.glb"):
+        refused(capsys, "export", tmp_path / "a.ply", tmp_path / name, says="one moment; say which by --frame")
+        assert main(["export", str(tmp_path / "a.ply"), str(tmp_path / name), "--frame", "20"]) == 0
+
+
 def test_view_opens_a_page(tmp_path, capsys, monkeypatch):
     opened, answers = [], [True, False]
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or answers.pop(0))

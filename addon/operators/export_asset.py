@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""File > Export > 4D Gaussians: the active asset object as .ply, .splat, USD or a web page, where and as it is now.
+"""File > Export > 4D Gaussians: the active asset object as .ply, USD, a web page, .splat, .spz or .glb, where and as
+it is now.
 
     bpy.ops.timesplat.export_asset(filepath="a.usdz", half=True)          the suffix says the format
     bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame
@@ -37,20 +38,19 @@ from .original_usd import original_usd
 REPORT = "Timesplat USD report"
 SUFFIXES = {
     **{"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz"},
-    **{"PAGE": ".html", "SLICE": ".ply", "SPLAT": ".splat", "SLICES": ""},
+    **{"PAGE": ".html", "SLICE": ".ply", "SPLAT": ".splat", "SPZ": ".spz", "GLB": ".glb", "SLICES": ""},
 }
+MOMENTS = ("SLICE", "SPLAT", "SPZ", "GLB")  # which hold the current frame
 FORMAT_ITEMS = [
     ("PLY", "4D PLY", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
     ("USDC", "USDC (binary)", "USD for pipelines"),
     ("USDA", "USDA (text)", "USD to look into: large"),
     ("USDZ", "USDZ (package)", "USD in one file with all it needs"),
-    (
-        "PAGE",
-        "Web Page",
-        "One file that plays in any browser, from disk and without network",
-    ),
+    ("PAGE", "Web Page", "One file that plays in any browser, from disk and without network"),
     ("SLICE", "3DGS PLY, this frame", "For 3DGS viewers and tools: what is visible at the current frame"),
     ("SPLAT", ".splat, this frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
+    ("SPZ", ".spz, this frame", "Niantic's packed splats: what is visible at the current frame, in few bytes"),
+    ("GLB", ".glb, this frame", "glTF with KHR_gaussian_splatting: what is visible at the current frame"),
     ("SLICES", "3DGS PLY, all frames", "A new folder with what the timeline shows at every frame of the scene"),
 ]
 MODE_ITEMS = [
@@ -201,7 +201,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         ob, scene = context.object, context.scene
         context.view_layer.update()  # a script may have moved it just now
         frame = scene.frame_current_final
-        if self.format in ("SLICE", "SPLAT"):
+        if self.format in MOMENTS:
             part = moment(ob, asset_of(ob), frame, self.apply_sliders)
             count = write_asset(path, part, frame=frame, cut=0)
             if not part.opacity.any():
@@ -247,7 +247,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
 
 def _menu(self, context):
-    self.layout.operator("timesplat.export_asset", text="4D Gaussians (.ply, .splat, .usd, .html)")
+    self.layout.operator("timesplat.export_asset", text="4D Gaussians (.ply, .usd, .html, .splat, .spz, .glb)")
 
 
 def register() -> None:

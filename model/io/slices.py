@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Moments of a 4D asset for tools that know nothing of time: plain 3DGS .ply and .splat, one or a folder of them.
-numpy and the standard library only, for inside Blender.
+"""Moments of a 4D asset for tools that know nothing of time: plain 3DGS .ply, .splat, .spz and .glb (slice_formats.py),
+or a folder of .ply. numpy and the standard library only, for inside Blender.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from ...datagen.sequence import InputError
 from .asset import VISIBLE, Asset, check, static_asset
 from .atomic import atomic_write
 from .placement import rotate_quaternions
-from .ply import columns_3dgs, ply_bytes
-from .splat_files import SPLAT_RECORD
+from .slice_formats import SLICE_FORMATS, ply
 
 MINUS_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)  # (x, y, z) of Z up -> (x, -z, y)
 
@@ -45,7 +44,7 @@ def slice_at(asset: Asset, frame: float, cut: float = VISIBLE) -> Asset:
 
 
 def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIBLE) -> int:
-    """Writes `slice_at` as a plain 3DGS .ply or as a .splat, by the suffix; whole or not at all. Returns the
+    """Writes `slice_at` as one of SLICE_FORMATS, by the suffix; whole or not at all. Returns the
     number of Gaussians. Raises InputError."""
     path = Path(path)
     check(asset, path)
@@ -53,10 +52,14 @@ def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIB
         raise InputError(f"{frame}: the frame must be a number; give one.")
     encode = SLICE_FORMATS.get(path.suffix.lower())
     if encode is None:
-        raise InputError(f"{path}: the name of a slice must end in {' or '.join(SLICE_FORMATS)}; choose one of these.")
+        raise InputError(f"{path}: the name of a slice must end in {', '.join(SLICE_FORMATS)}; choose one of these.")
     part = slice_at(asset, frame, cut)
+    try:
+        data = encode(part, frame)
+    except InputError as e:
+        raise InputError(f"{path}: {e}") from None
     with atomic_write(path) as tmp:
-        tmp.write_bytes(encode(part, frame))
+        tmp.write_bytes(data)
     return len(part)
 
 
@@ -80,27 +83,10 @@ def write_moments(folder: str | Path, moments: Iterable[tuple[int, Asset]], stem
             whole.mkdir()
             for frame, asset in moments:
                 count += 1
-                (whole / f"{stem}_{frame:04d}.ply").write_bytes(_ply(slice_at(asset, frame, cut), frame))
+                (whole / f"{stem}_{frame:04d}.ply").write_bytes(ply(slice_at(asset, frame, cut), frame))
             if folder.is_dir():
                 folder.rmdir()
             shutil.move(whole, folder)
     except OSError as e:
         raise InputError(f"{folder}: it cannot be written ({e.strerror or e}); choose another place.") from None
     return count
-
-
-def _ply(part: Asset, frame: float) -> bytes:
-    return ply_bytes(columns_3dgs(part), [f"frame {frame:g} of a 4D asset by Timesplat, -Y is up"])
-
-
-def _splat(part: Asset, frame: float) -> bytes:
-    """Large and opaque ones first, because viewers show a .splat while it loads."""
-    order = np.argsort(-part.scale.prod(1, dtype=np.float64) * part.opacity, kind="stable")
-    rows = np.empty(len(part), SPLAT_RECORD)
-    rows["xyz"], rows["scale"] = part.xyz, part.scale
-    rows["rgb"], rows["opacity"] = (np.round(a.clip(0, 1) * 255) for a in (part.rgb, part.opacity))
-    rows["rotation"] = np.round(part.rotation * 128 + 128).clip(0, 255)
-    return rows[order].tobytes()
-
-
-SLICE_FORMATS = {".ply": _ply, ".splat": _splat}

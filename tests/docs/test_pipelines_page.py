@@ -59,7 +59,7 @@ def page(tmp_path_factory, fox) -> Path:
     write_ply(folder / "fox.ply", fox)
     make_original(folder)
     commands = [line.split("#")[0].split()[1:] for line in PAGE.splitlines() if re.match(r"timesplat export \w", line)]
-    assert len(commands) == 9
+    assert len(commands) == 10
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for command in commands:
@@ -75,7 +75,7 @@ def page(tmp_path_factory, fox) -> Path:
         ("fox.ply", "name one file to write, or a folder"),
         ("fox.ply a.usdc --sequence b", "name one file to write, or a folder"),
         ("fox.ply a.ply --half", "a.ply: --mode, --half, --original and --check are for USD"),
-        ("fox.ply a.usdc --frame 3", "--frame is for one .ply or .splat"),
+        ("fox.ply a.usdc --frame 3", "--frame is for one moment's file"),
         ("fox.ply a.obj", "a.obj: cannot write that"),
         ("fox.ply a.usdz --original none.usd", "none.usd: no such file"),
         ("scene.usda a.ply", "scene.usda: no prim is a ParticleField3DGaussianSplat"),

@@ -61,6 +61,19 @@ def test_a_page_holds_what_the_ply_does(blender, folder):
     same(formats.read_asset(folder / "out.html").asset, read_ply(folder / "out.ply"), 0, 0)
 
 
+def test_the_current_frame_in_other_programs_formats(blender, folder):
+    code = "scene.frame_set(20)\ntell(done=[save(f'a.{x}') for x in ('splat', 'spz', 'glb')])"
+    assert blender(EXPORT + code, folder)["done"] == [["FINISHED"]] * 3
+    asset = read_ply(folder / "in.ply")
+    xyz, opacity = asset.at(asset.frame_to_time(20))
+    world = xyz[opacity >= VISIBLE] * CLIP.scale + np.array(CLIP.translation)
+    for suffix in ("splat", "spz"):
+        got = formats.upright(formats.read_asset(folder / f"a.{suffix}")).xyz
+        assert len(got) == len(world)
+        assert np.abs(got[:, None] - world[None]).max(2).min(1).max() < 2e-5  # in another order
+    assert (folder / "a.glb").read_bytes()[:4] == b"glTF"
+
+
 def test_deleted_gaussians_and_sliders_reach_the_file(blender, folder):
     code = """
 edit.keep_gaussians(ob, np.arange(120) % 3 > 0)
