@@ -110,9 +110,12 @@ def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     from .model.fitting.quality import QUALITIES
 
     meanings = "; ".join(f"{n}: {q.size} pixels, {q.steps:,} steps, {q.gaussians:,}" for n, q in QUALITIES.items())
-    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote, or one in the format "
-                   "of D-NeRF")  # fmt: skip
+    from .datagen.readers.options import add_arguments
+
+    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote, or one of D-NeRF, nerfstudio, "
+                   "instant-ngp, COLMAP or Panoptic")  # fmt: skip
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
+    add_arguments(p)
     p.add_argument("--method", help="tracks, lift, guided, rgb, sweep, predicted, 4dgs (default: tracks "
                    "where the renderer wrote surface tracks, else guided where it wrote depth, else rgb)")  # fmt: skip
     p.add_argument("--quality", help="how much is fitted, and the same comes out however busy the machine is: the "
@@ -140,6 +143,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     import time
 
     from .datagen.readers import open_sequence
+    from .datagen.readers.options import from_arguments
     from .evaluation.protocol import all_inputs
     from .model import baselines  # noqa: F401, adds its methods
     from .model.clip import clip_of
@@ -165,7 +169,9 @@ def reconstruct(args: argparse.Namespace) -> int:
         budget=args.budget,
         max_loss=args.max_loss,
     )
-    seq = open_sequence(args.sequence)
+    seq = open_sequence(args.sequence, from_arguments(args))
+    for line in seq.provenance.get("read", []):
+        print(line)
     rigs = sorted({v.rig for v in seq.views})
     if args.rig and args.rig not in rigs:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")

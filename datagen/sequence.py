@@ -87,6 +87,7 @@ class Sequence:
     untracked: list[str] = field(default_factory=list)  # what is seen and has none, by the objects' names
     root: Path | None = None  # the folder it was read from
     remedy: str = "render the Sequence again"  # what to do where a file of it is missing or damaged
+    picture: Callable[[View], np.ndarray] | None = None  # how a view's picture is read where its file is not yet RGBA
 
     def unit_time(self, frame: float) -> float:
         """0..1 over the clip; 0 where the clip is one frame."""
@@ -131,6 +132,8 @@ class Sequence:
 
     def load_image(self, index: int) -> np.ndarray:
         """(H,W,4) uint8 RGBA, straight alpha, sRGB-encoded. Raises InputError naming the file."""
+        if self.picture is not None:
+            return self.picture(self.views[index])
         from PIL import Image
 
         path = self.folder / self.views[index].image
@@ -370,9 +373,10 @@ def check_sequence(seq: Sequence, path: Path) -> None:
     s = seq.normalisation
     if not (s.scale > 0 and np.isfinite([s.scale, *s.translation]).all()):
         raise InputError(f"{path}: the normalisation is not a finite positive scale; {seq.remedy}.")
-    root = path.parent.resolve()
+    folder = seq.root or path.parent
+    root = folder.resolve()
     if seq.tracks:
-        _check_file(seq, path, root, seq.tracks)
+        _check_file(seq, path, folder, root, seq.tracks)
     for v in seq.views:
         name = v.image or "?"
         R = v.c2w[:3, :3] if v.c2w.shape == (4, 4) else None
@@ -383,12 +387,12 @@ def check_sequence(seq: Sequence, path: Path) -> None:
         if not (v.fx > 0 and v.fy > 0 and np.isfinite([v.fx, v.fy, v.cx, v.cy]).all()):
             raise InputError(f"{path}: the focal length of {name} is not positive; correct it.")
         for rel in filter(None, (v.image, v.passes)):
-            _check_file(seq, path, root, rel)
+            _check_file(seq, path, folder, root, rel)
 
 
-def _check_file(seq: Sequence, path: Path, root: Path, relative: str) -> None:
-    """Raises InputError unless the file is there, and below the Sequence's folder `root`."""
-    full = (path.parent / relative).resolve()
+def _check_file(seq: Sequence, path: Path, folder: Path, root: Path, relative: str) -> None:
+    """Raises InputError unless the file is there, and below the Sequence's folder, `root` when resolved."""
+    full = (folder / relative).resolve()
     if not full.is_relative_to(root):
         raise InputError(f"{path}: {relative} points outside of the Sequence's folder; correct it.")
     if not full.is_file():

@@ -3,27 +3,94 @@
 
 from __future__ import annotations
 
+import copy
+import json
 import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 
-from ..sequence import InputError, Sequence, read_sequence
+from ..sequence import FORMAT, InputError, Sequence, read_sequence
+from .colmap import model_folder, read_colmap
 from .dnerf import SPLITS, read_dnerf
+from .options import ReadOptions
+from .panoptic import SPLITS as META_SPLITS
+from .panoptic import read_panoptic
+from .posed import PosedScene, assemble
+from .transforms import read_transforms
 
-OURS, DNERF = "transforms.json", "transforms_train.json"
+OURS, DNERF, PANOPTIC = "transforms.json", "transforms_train.json", "train_meta.json"
+DEFAULTS = ReadOptions()
 
 
-def open_sequence(folder: Path) -> Sequence:
-    """The Sequence in a folder: `transforms.json` is our own format, else `transforms_train.json` that of D-NeRF and
-    NeRF's synthetic scenes. Raises InputError where there is neither, and as `read_sequence` and `read_dnerf` do."""
+@dataclass(frozen=True)
+class Layout:
+    """Others' layout that says nothing but pictures and cameras, all else is found out."""
+
+    read: Callable[[Path], PosedScene]
+    files: Callable[[Path], list[Path]]  # that describe it
+
+
+def _colmap_files(folder: Path) -> list[Path]:
+    model = model_folder(folder)
+    return sorted(p for p in model.iterdir() if p.suffix in (".bin", ".txt")) if model else []
+
+
+TRANSFORMS = Layout(read_transforms, lambda folder: [folder / OURS])
+META = Layout(read_panoptic, lambda folder: [p for p in (folder / n for n in META_SPLITS) if p.is_file()])
+COLMAP = Layout(read_colmap, _colmap_files)
+
+
+def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
+    """The Sequence in a folder, by what it holds: `transforms.json` of ours, or of nerfstudio or instant-ngp;
+    `transforms_train.json` of D-NeRF and NeRF's synthetic scenes; `train_meta.json` of Panoptic; COLMAP's tables.
+    options: what the user says of others' data. Raises InputError where there is none of these, and as `read_sequence`,
+    `read_dnerf` and `assemble` do."""
     folder = Path(folder)
-    if (folder / OURS).is_file():
+    if _layout(folder):
+        stamps = tuple(path.stat().st_mtime_ns for path in described_by(folder))
+        return copy.deepcopy(_assembled(folder.absolute(), stamps, options))
+    told = [f"--{f.name}" for f in fields(options) if getattr(options, f.name) != f.default]
+    ours = (folder / OURS).is_file()
+    if told and (ours or told != ["--background"]) and (ours or (folder / DNERF).is_file()):
+        raise InputError(f"{folder}: {told[0]} is for layouts that leave it open; this one says it itself.")
+    if ours:
         return read_sequence(folder)
     if (folder / DNERF).is_file():
-        return read_dnerf(folder)
+        return read_dnerf(folder, options)
     raise InputError(
-        f"{folder / OURS}: no such file, nor {DNERF}; give a folder that `timesplat render` wrote, or one in the "
-        "format of D-NeRF."
+        f"{folder / OURS}: no such file, nor {DNERF}, {PANOPTIC} or COLMAP's sparse/0; give a folder that `timesplat "
+        "render` wrote, or one of D-NeRF, nerfstudio, instant-ngp, COLMAP or Panoptic."
     )
+
+
+@lru_cache(maxsize=8)
+def _assembled(folder: Path, stamps: tuple[int, ...], options: ReadOptions) -> Sequence:
+    """To find the volume takes seconds, and an evaluation opens a Sequence many times."""
+    layout = _layout(folder)
+    assert layout is not None
+    return assemble(layout.read(folder), options)
+
+
+def _layout(folder: Path) -> Layout | None:
+    """Of others' layouts the one that a folder has; None for ours, for D-NeRF's, and where there is nothing."""
+    if (folder / OURS).is_file():
+        return None if _is_ours(folder / OURS) else TRANSFORMS
+    if (folder / DNERF).is_file():
+        return None
+    if (folder / PANOPTIC).is_file():
+        return META
+    return COLMAP if model_folder(folder) else None
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a transforms.json is of a Sequence; also where it is damaged, which is told by who reads that."""
+    try:
+        d = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return True
+    return not isinstance(d, dict) or "frames" not in d or str(d.get("format", "")).startswith(FORMAT)
 
 
 def sequences_in(root: Path) -> list[Path]:
@@ -32,13 +99,17 @@ def sequences_in(root: Path) -> list[Path]:
     found = []
     for folder, below, files in os.walk(root):
         below[:] = [name for name in below if not name.startswith(".")]
-        if not {OURS, DNERF}.isdisjoint(files):
+        if not {OURS, DNERF, PANOPTIC}.isdisjoint(files) or ({"sparse", "colmap"} & {*below} and _layout(Path(folder))):
             found.append(Path(folder))
+            # What else lies below it is its own: a COLMAP project beside nerfstudio's file is the same pictures.
+            below[:] = [name for name in below if name not in ("sparse", "colmap")]
     return sorted(found)
 
 
 def described_by(folder: Path) -> list[Path]:
     """The files that say what the Sequence in a folder is; a change of it shows in them."""
+    if layout := _layout(folder):
+        return layout.files(folder)
     names = [OURS] if (folder / OURS).is_file() else [f"transforms_{split}.json" for split in SPLITS]
     return [folder / name for name in names if (folder / name).is_file()]
 
@@ -47,4 +118,4 @@ def name_of(folder: Path) -> str:
     """What a Sequence is called: ours by the folder above, which is the object's (its own is the clip's), others by
     their own."""
     folder = folder.absolute()
-    return folder.parent.name if (folder / OURS).is_file() else folder.name
+    return folder.parent.name if (folder / OURS).is_file() and _layout(folder) is None else folder.name

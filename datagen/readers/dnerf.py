@@ -24,6 +24,10 @@ from ..sequence import (
     frame_number,
     read_from,
 )
+from .lenses import Lens
+from .options import ReadOptions
+from .pictures import Pictures, Source, background_of, size_of
+from .volume import normalisation_of_views
 
 SPLITS = {"train": "train", "val": "val", "test": "target"}  # the rig of each
 FPS = 24.0  # the format has no rate
@@ -32,10 +36,10 @@ REMEDY = "correct it, or get the data set again"
 SNAP = 1e-3  # frames: as much rounding of a printed time is taken back
 
 
-def read_dnerf(folder: Path) -> Sequence:
+def read_dnerf(folder: Path, options: ReadOptions | None = None) -> Sequence:
     """Reads and checks the scene in a folder; pictures are read later, but that they exist is checked now. Its clip has
     as many frames as there are distinct times of train views; times between them are fractions of a frame. It is
-    normalised by its cameras, see `normalisation_of`.
+    normalised by its cameras, see `normalisation_of`. Pictures without alpha have a background, measured or told.
 
     Raises InputError naming the file and the fault: missing or damaged JSON, no camera_angle_x, a missing picture, a
     camera that is not a rigid finite transform, a time that is not within 0..1, cameras that do not look at one place.
@@ -59,6 +63,13 @@ def read_dnerf(folder: Path) -> Sequence:
     seq.normalisation = normalisation_of([v for v in seq.views if v.rig == "train"], width, height, files["train"])
     for v in seq.views:
         v.c2w = seq.normalisation.from_world(v.c2w)
+    if not size_of(folder / seq.views[0].image, True, REMEDY)[2]:
+        lenses = {v.image: Lens(width, height, v.fx, v.fy, v.cx, v.cy) for v in seq.views}
+        sources = {name: Source(folder / name, None, lens) for name, lens in lenses.items()}
+        asked = options.background if options else "auto"
+        background, told = background_of(list(sources.values()), False, False, asked, REMEDY)
+        seq.picture = Pictures(sources, background, False, REMEDY)
+        seq.provenance["read"] = [told]
     return seq
 
 
@@ -68,17 +79,8 @@ def normalisation_of(views: list[View], width: int, height: int, path: Path) -> 
     (whichever is less). Raises InputError naming `path` where the axes are parallel, or meet behind the cameras."""
     place = np.array([v.c2w[:3, 3] for v in views])
     axis = np.array([-v.c2w[:3, 2] for v in views])
-    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]  # (V,3,3) onto the plane that the axis stands on
-    total = across.mean(0)
-    if np.linalg.eigvalsh(total)[0] < 1e-6:
-        raise InputError(f"{path}: its cameras all look the same way, so nothing tells how far away the object is; "
-                         "give views from several sides.")  # fmt: skip
-    centre = np.linalg.solve(total, (across @ place[:, :, None]).mean(0)[:, 0])
-    if np.median(((centre - place) * axis).sum(1)) <= 0:
-        raise InputError(f"{path}: its cameras look away from one another; give views that surround an object.")
-    slope = [min(width / v.fx, height / v.fy) / 2 for v in views]  # tan of half the smaller field of view
-    scale = float(np.median(np.linalg.norm(centre - place, axis=1) * slope))
-    return Normalisation(scale, (float(centre[0]), float(centre[1]), float(centre[2])))
+    slope = np.array([min(width / v.fx, height / v.fy) / 2 for v in views])
+    return normalisation_of_views(place, axis, slope, path)
 
 
 def _load(path: Path) -> dict:

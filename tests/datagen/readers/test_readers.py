@@ -3,11 +3,17 @@
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from timesplat.datagen.readers import described_by, name_of, open_sequence, sequences_in
+from timesplat.datagen.readers.options import ReadOptions
 from timesplat.datagen.sequence import InputError
+
+from .worlds import PLAIN, shots, write_colmap, write_panoptic, write_pictures, write_transforms
 
 
 def test_each_folder_finds_its_reader(sphere_folder, write_dnerf):
@@ -19,7 +25,9 @@ def test_each_folder_finds_its_reader(sphere_folder, write_dnerf):
 
 
 def test_what_is_neither_is_told_what_is_read(tmp_path):
-    with pytest.raises(InputError, match=r"transforms\.json: no such file, nor transforms_train\.json; give a folder"):
+    with pytest.raises(
+        InputError, match=r"transforms\.json: no such file, nor transforms_train\.json, .* give a folder"
+    ):
         open_sequence(tmp_path)
 
 
@@ -109,3 +117,76 @@ def test_bad_input_is_a_sentence_and_exit_code_2(as_dnerf, tmp_path, capsys, com
         assert main([command, str(as_dnerf), "--out", str(tmp_path / "out.ply"), *words, *size]) == 2
         told = capsys.readouterr().err.strip().splitlines()
         assert says in told[-1] and told[-1].startswith("timesplat: ") and not (tmp_path / "out.ply").exists()
+
+
+def test_layouts_of_others_are_found_and_named(tmp_path):
+    taken = shots(4)
+    for name in ("fox", "tree/colmap"):
+        write_pictures(tmp_path / name, taken)
+    write_transforms(tmp_path / "fox", taken)
+    write_colmap(tmp_path / "fox" / "colmap", taken, ["0000.png"] * 4)  # that it was made from: not another scene
+    write_colmap(tmp_path / "tree" / "colmap", taken, [f"{k:04d}.png" for k in range(4)])
+    rig = [[replace(s, camera=str(k)) for k, s in enumerate(taken)]]
+    write_panoptic(tmp_path / "ball", rig)
+    folders = [tmp_path / "ball", tmp_path / "fox", tmp_path / "tree"]
+    assert sequences_in(tmp_path) == folders
+    assert [name_of(f) for f in folders] == ["ball", "fox", "tree"]
+    assert [[p.name for p in described_by(f)] for f in folders] == [
+        ["train_meta.json", "test_meta.json"],
+        ["transforms.json"],
+        ["cameras.txt", "images.txt", "points3D.txt"],
+    ]
+    with pytest.raises(InputError, match=r"fox/images/0002\.png"):
+        (tmp_path / "fox/images/0002.png").unlink()
+        open_sequence(tmp_path / "fox")
+
+
+def test_options_are_for_what_leaves_it_open(sphere_folder, write_dnerf):
+    with pytest.raises(InputError, match="--axes is for layouts that leave it open"):
+        open_sequence(sphere_folder, ReadOptions(axes="opencv"))
+    for options in (ReadOptions(scale=2), ReadOptions(background="white", times="none")):
+        with pytest.raises(InputError, match="is for layouts that leave it open"):
+            open_sequence(write_dnerf(f"s{options.scale}"), options)
+
+
+def test_what_is_opened_twice_is_not_shared(tmp_path):
+    taken = shots(6)
+    write_pictures(tmp_path, taken)
+    write_transforms(tmp_path, taken)
+    first = open_sequence(tmp_path)
+    first.views[0].c2w[:] = 0
+    assert open_sequence(tmp_path).views[0].c2w.any()
+
+
+def test_pictures_on_white_in_the_format_of_d_nerf(write_dnerf):
+    folder = write_dnerf()
+    picture = np.full((4, 6, 3), 255, np.uint8)
+    picture[2, 3] = (200, 20, 20)
+    for path in folder.rglob("*.png"):
+        Image.fromarray(picture).save(path)
+    seq = open_sequence(folder)
+    assert (seq.load_image(2)[..., 3] > 0).sum() == 1 and "#ffffff" in seq.provenance["read"][0]
+    black = open_sequence(folder, ReadOptions(background="black")).load_image(2)
+    assert (black[..., 3] == 255).all()
+
+
+def test_a_folder_of_others_is_reconstructed_and_evaluated(tmp_path, capsys):
+    """With the folder alone; what was done is said."""
+    pytest.importorskip("torch")
+    from timesplat.cli import main
+    from timesplat.model.io.ply import read_ply
+
+    taken = shots(12, lens=PLAIN.resized(32, 32))
+    write_pictures(tmp_path / "scene", taken, white=True)
+    names = [f"images/{k:04d}.png" for k in range(12)]
+    write_transforms(tmp_path / "scene", taken, test_filenames=names[9:])
+    ply = tmp_path / "a.ply"
+    assert main(["reconstruct", str(tmp_path / "scene"), "--method", "hull", "--out", str(ply)]) == 0
+    said = capsys.readouterr().out
+    assert "measured there" in said and "visual hull" in said and "from 9 views" in said
+    assert len(read_ply(ply)) > 10
+    words = ["--setup", "split", "--size", "16", "--methods", "white,hull", "--out", str(tmp_path / "out")]
+    assert main(["evaluate", str(tmp_path / "scene"), *words]) == 0
+    rows = [json.loads(x) for x in (tmp_path / "out" / "rows.jsonl").read_text().splitlines()]
+    assert [(r["object"], len(r["frames"]["psnr"])) for r in rows] == [("scene", 3)] * 2
+    assert main(["reconstruct", str(tmp_path / "scene"), "--axes", "unity", "--out", str(ply)]) == 2

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What every layout of others' data says, in one form, and how it becomes a Sequence.
+
+A reader fills a `PosedScene` with what its files hold. `assemble` does the rest, the same for all of them: moments,
+cameras in one convention, sizes, backgrounds, and the volume, found and not assumed. What it did is said in
+`provenance["read"]`, a list of sentences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..sequence import InputError, Normalisation, Sequence, View, check_sequence, opengl_to_opencv
+from . import volume
+from .lenses import Lens
+from .options import AXES, ReadOptions
+from .pictures import Pictures, Source, background_of, scaled_to, size_of
+from .times import clip_of, of_names
+
+REMEDY = "correct it, or get the data set again"
+HELD_OUT = ("val", "target")
+
+
+@dataclass
+class Posed:
+    """A picture with its camera, as a layout says it."""
+
+    image: str  # path below the scene's folder, which is there
+    matrix: np.ndarray  # (4,4) in the layout's convention
+    lens: Lens
+    time: float | None = None
+    frame: float | None = None
+    camera: str | None = None
+    rig: str = "train"
+    mask: str | None = None
+
+
+@dataclass
+class PosedScene:
+    """All that the files of a folder say."""
+
+    folder: Path
+    path: Path  # the file that complaints are about
+    layout: str
+    pictures: list[Posed]
+    axes: str = "opengl"
+    fps: float | None = None
+    frame_range: tuple[int | None, int | None] = (None, None)
+    points: np.ndarray | None = None  # (P,3) that are known of the scene, in the cameras' world
+    upright: bool | None = None  # whether EXIF's rotation is carried out; None: as the stated sizes say
+    notes: list[str] = field(default_factory=list)
+    provenance: dict = field(default_factory=dict)
+
+
+def assemble(scene: PosedScene, options: ReadOptions) -> Sequence:
+    """The scene as a Sequence, whose pictures are read when they are asked for. Raises InputError naming the file and
+    the fault, see the tests of what is refused."""
+    if not scene.pictures:
+        raise InputError(f"{scene.path}: it has no pictures; {REMEDY}.")
+    sources, has_alpha, masked = _sources(scene)
+    background, behind = background_of(list(sources.values()), masked, has_alpha, options.background, REMEDY)
+    pictures = Pictures(sources, background, has_alpha or masked, REMEDY)
+    told = [f"{scene.layout}: {len(scene.pictures)} pictures", *scene.notes, *_lens_notes(sources, pictures), behind]
+
+    names, cameras = [p.image for p in scene.pictures], [p.camera for p in scene.pictures]
+    times, frames = [p.time for p in scene.pictures], [p.frame for p in scene.pictures]
+    by_name = options.times is not None or all(x is None for x in (*times, *frames))
+    if by_name:
+        times = [None] * len(names)
+        frames, named = of_names(names, options.times)
+        cameras = [a or b for a, b in zip(cameras, named, strict=True)]
+    clip = clip_of(names, times, frames, scene.fps, scene.frame_range, scene.path)
+    told.append(f"moments: {clip.told}" + (" in the file names" if by_name and clip.end > clip.start else ""))
+
+    seq = Sequence(pictures.width, pictures.height, clip.fps, clip.start, clip.end, root=scene.folder, remedy=REMEDY)
+    seq.picture = pictures
+    read = AXES[options.axes or scene.axes]
+    ids = _cameras(scene, cameras)
+    for p, frame, camera in zip(scene.pictures, clip.frames, ids, strict=True):
+        fx, fy, cx, cy = pictures.intrinsics(p.image)
+        c2w = _checked(p, scene, read)
+        seq.views.append(View(frame, camera, p.rig, c2w, fx, fy, cx, cy, p.image))
+    check_sequence(seq, scene.path)
+    seq.normalisation, where, seq.aabb = _volume(scene, seq, pictures, options)
+    told.append(where)
+    for v in seq.views:
+        v.c2w = seq.normalisation.from_world(v.c2w)
+    seq.provenance = {"asset": scene.folder.absolute().name, "format": scene.layout, **scene.provenance, "read": told}
+    return seq
+
+
+def _sources(scene: PosedScene) -> tuple[dict[str, Source], bool, bool]:
+    """Every picture's file, mask and lens at the size it has; whether any has alpha, and whether any a mask."""
+    sources: dict[str, Source] = {}
+    has_alpha = False
+    root = scene.folder.resolve()
+    for p in scene.pictures:
+        for name in filter(None, (p.image, p.mask)):
+            if not (root / name).resolve().is_relative_to(root):
+                raise InputError(f"{scene.path}: {name} points outside of the folder; correct it.")
+        image = scene.folder / p.image
+        stated = (p.lens.width, p.lens.height)
+        size, turned, alpha = size_of(image, True, REMEDY)
+        upright = scene.upright if scene.upright is not None else not (turned and size == stated[::-1] != stated)
+        if turned and not upright:
+            size = size[::-1]
+        lens = scaled_to(p.lens, size)
+        if lens is None:
+            raise InputError(
+                f"{image}: the image is {size[0]}x{size[1]}, stated are {stated[0]}x{stated[1]}; {REMEDY}."
+            )
+        if lens is not p.lens:
+            note = f"pictures are {size[0]}x{size[1]}, not {stated[0]}x{stated[1]} as stated: lenses are scaled to them"
+            scene.notes += [] if note in scene.notes else [note]
+        mask = scene.folder / p.mask if p.mask else None
+        if mask:
+            found, _, _ = size_of(mask, upright, REMEDY)
+            if found != size:
+                raise InputError(
+                    f"{mask}: the mask is {found[0]}x{found[1]}, its picture {size[0]}x{size[1]}; give masks of the "
+                    "pictures' size."
+                )
+        has_alpha |= alpha
+        sources[p.image] = Source(image, mask, lens, upright)
+    return sources, has_alpha, any(s.mask for s in sources.values())
+
+
+def _lens_notes(sources: dict[str, Source], pictures: Pictures) -> list[str]:
+    out = []
+    bent = [s.lens for s in sources.values() if not s.lens.straight]
+    if bent:
+        kind = "fisheye" if bent[0].fisheye else "lens"
+        out.append(f"{kind} distortion of {len(bent)} pictures is undone")
+    other = sum((s.lens.width, s.lens.height) != (pictures.width, pictures.height) for s in sources.values())
+    if other:
+        out.append(f"{other} pictures of other sizes are brought to {pictures.width}x{pictures.height}")
+    return out
+
+
+def _cameras(scene: PosedScene, told: list[str | None]) -> list[str]:
+    """A name for each picture's camera; where nothing names them, pictures of the same pose and lens share one."""
+    if all(told):
+        return [str(t) for t in told]
+    seen: dict[tuple, str] = {}
+    out = []
+    for p in scene.pictures:
+        key = (p.lens, *np.round(p.matrix, 9).ravel())
+        out.append(seen.setdefault(key, f"{len(seen):03d}"))
+    return out
+
+
+def _checked(p: Posed, scene: PosedScene, read) -> np.ndarray:
+    """The camera-to-world matrix (4,4), OpenGL axes, of a picture. Raises InputError where it is none."""
+    m = p.matrix
+    if not np.isfinite(m).all():
+        raise InputError(f"{scene.path}: the camera of {p.image} is not a finite matrix; correct it.")
+    if abs(np.linalg.det(m[:3, :3])) < 1e-9:
+        raise InputError(f"{scene.path}: the camera of {p.image} is singular or not a rotation; correct it.")
+    c2w = read(m)
+    if np.linalg.det(c2w[:3, :3]) < 0:
+        raise InputError(f"{scene.path}: the camera of {p.image} is left-handed; pass --axes left-handed.")
+    return np.asarray(c2w, np.float64)
+
+
+def silhouettes_of(seq: Sequence, pictures: Pictures) -> volume.Silhouettes:
+    """Small masks of some views that are not held out, spread over the clip."""
+    inputs = [i for i, v in enumerate(seq.views) if v.rig not in HELD_OUT] or list(range(len(seq.views)))
+    windows = volume.chosen_views(np.array([seq.views[i].frame for i in inputs]))
+    views = [inputs[k] for window in windows for k in window]
+    masks = np.stack([pictures.alpha(seq.views[i], volume.SIDE) > 0.5 for i in views])
+    shrink = np.array([masks.shape[2] / seq.width, masks.shape[1] / seq.height] * 2)
+    c2w = opengl_to_opencv(np.stack([seq.views[i].c2w for i in views]))
+    intrinsics = np.array([[v.fx, v.fy, v.cx, v.cy] for v in (seq.views[i] for i in views)]) * shrink
+    return volume.Silhouettes(masks, c2w, intrinsics, np.repeat(np.arange(len(windows)), [len(w) for w in windows]))
+
+
+def _volume(
+    scene: PosedScene, seq: Sequence, pictures: Pictures, options: ReadOptions
+) -> tuple[Normalisation, str, list]:
+    """What leads from the unit box back to the cameras' world, in words where it is from, and the object's box."""
+    cut = pictures.has_alpha or pictures.background is not None
+    unit = [[-1, -1, -1], [1, 1, 1]]
+    place = np.array([v.c2w[:3, 3] for v in seq.views])
+    axis = np.array([-v.c2w[:3, 2] for v in seq.views])
+    slope = np.array([min(seq.width / v.fx, seq.height / v.fy) / 2 for v in seq.views])
+    if options.aabb:
+        low, high = np.array(options.aabb[:3]), np.array(options.aabb[3:])
+        norm = volume.normalisation_around(low, high)
+        return norm, _where(norm, "the box that --aabb says"), _box(norm, low, high)
+    if cut:
+        sil = silhouettes_of(seq, pictures)
+        if not sil.masks.any():
+            raise InputError(
+                f"{scene.path}: no picture shows anything of an object; check the masks or the background."
+            )
+        box = volume.box_of(sil)
+        if box is None:
+            raise InputError(
+                f"{scene.path}: its cameras do not look at one object: the silhouettes have no place in common; "
+                "`timesplat inspect` says whether another reading of the axes fits."
+            )
+        low, high, points = box
+        norm = volume.normalisation_around(low, high, points)
+        if options.scale:
+            norm = Normalisation(options.scale, norm.translation)
+            return norm, _where(norm, "as large as --scale says, around the silhouettes"), _box(norm, low, high)
+        return norm, _where(norm, f"the visual hull of {len(sil.masks)} silhouettes"), _box(norm, low, high)
+    norm = volume.normalisation_of_views(place, axis, slope, scene.path)
+    if options.scale:
+        norm = Normalisation(options.scale, norm.translation)
+        return norm, _where(norm, "as large as --scale says, around what the cameras look at"), unit
+    if scene.points is not None and len(scene.points):
+        sil = volume.Silhouettes(
+            np.broadcast_to(np.array(True), (len(seq.views), seq.height, seq.width)),
+            opengl_to_opencv(np.stack([v.c2w for v in seq.views])),
+            np.array([[v.fx, v.fy, v.cx, v.cy] for v in seq.views]),
+            np.zeros(len(seq.views), int),
+        )
+        centre = np.array(norm.translation)
+        reach = float(np.median(np.linalg.norm(place - centre, axis=1)))
+        if seen := volume.bounds_of_points(scene.points, sil, reach, centre):
+            norm = volume.normalisation_around(*seen)
+            return (
+                norm,
+                _where(norm, f"the points that half of the cameras see, of {len(scene.points)}"),
+                _box(norm, *seen),
+            )
+    return norm, _where(norm, "what the cameras look at together"), unit
+
+
+def _where(norm: Normalisation, how: str) -> str:
+    x, y, z = norm.translation
+    return f"volume: {how}; ±{norm.scale:.4g} around ({x:.4g}, {y:.4g}, {z:.4g})"
+
+
+def _box(norm: Normalisation, low: np.ndarray, high: np.ndarray) -> list:
+    t = np.array(norm.translation)
+    return [((low - t) / norm.scale).tolist(), ((high - t) / norm.scale).tolist()]
