@@ -13,8 +13,6 @@ from functools import lru_cache
 
 import numpy as np
 
-ROWS = 256  # of a picture that are looked up at a time, so that large ones need no multiple of their memory
-
 
 @dataclass(frozen=True)
 class Lens:
@@ -77,49 +75,62 @@ def _slope(k: tuple[float, ...], u: np.ndarray) -> np.ndarray:
     return _polynomial(tuple((2 * n + 1) * x for n, x in enumerate(k, 1)), u)
 
 
+@dataclass(frozen=True)
+class Taps:
+    """Where the pixels of a picture come from in another: the upper left of four neighbours, numbered by rows, and how
+    much of the right and of the lower ones. Outside it is as at the border."""
+
+    corner: np.ndarray  # (…) int32
+    right: np.ndarray  # (…) float32 0..1
+    lower: np.ndarray  # (…) float32 0..1
+
+    @staticmethod
+    def at(u: np.ndarray, v: np.ndarray, width: int, height: int) -> Taps:
+        """For places u, v (…) in pixels, in a picture of two pixels or more each way."""
+        x, y = np.clip(u - 0.5, 0, width - 1), np.clip(v - 0.5, 0, height - 1)
+        left, upper = np.minimum(x.astype(np.int32), width - 2), np.minimum(y.astype(np.int32), height - 2)
+        return Taps(upper * width + left, (x - left).astype(np.float32), (y - upper).astype(np.float32))
+
+    def of(self, plane: np.ndarray) -> np.ndarray:
+        """plane (H,W) -> (…) float32 between its pixels, bilinear."""
+        flat, width = plane.ravel(), plane.shape[1]
+        a, b, c, d = (flat.take(self.corner + k).astype(np.float32) for k in (0, 1, width, width + 1))
+        upper = a + self.right * (b - a)
+        return upper + self.lower * (c + self.right * (d - c) - upper)
+
+
 @lru_cache(maxsize=3)
-def _sources(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each pixel (H,W) of the straight picture comes from, in pixels, float32, and whether from anywhere."""
+def _sources(lens: Lens) -> tuple[Taps, np.ndarray]:
+    """Where each pixel (H,W) of the straight picture comes from, and whether from anywhere."""
     y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
     u, v, holds = lens.pixels((x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy)
-    return u.astype(np.float32), v.astype(np.float32), holds
+    return Taps.at(u, v, lens.width, lens.height), holds
 
 
 def straighten(image: np.ndarray, lens: Lens) -> np.ndarray:
-    """(H,W,C) uint8 as the lens took it -> the same with straight lines: the pinhole camera with the lens's focal
+    """(H,W,4) uint8 RGBA as the lens took it -> the same with straight lines: the pinhole camera with the lens's focal
     lengths and principal point. Beyond its border the picture goes on as it is there; what no ray of the model reaches
-    is 0. The last of four channels is alpha, by which the others are weighted."""
+    is 0. Colours are weighted by alpha."""
     if lens.straight:
         return image
-    u, v, holds = _sources(lens)
-    out = np.empty_like(image)
-    for top in range(0, lens.height, ROWS):
-        rows = slice(top, top + ROWS)
-        part = sample(image, u[rows], v[rows])
-        out[rows] = np.where(holds[rows, :, None], part, 0)
+    taps, holds = _sources(lens)
+    out = sample(image, taps)
+    if not holds.all():
+        out[~holds] = 0
     return out
 
 
-def sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """image (H,W,C) uint8 between its pixels, at u, v (…) in pixels -> (…,C) uint8, bilinear; outside as at the border.
-    The last of four channels is alpha, by which the others are weighted."""
-    height, width, channels = image.shape
-    x, y = np.clip(u - 0.5, 0, width - 1), np.clip(v - 0.5, 0, height - 1)
-    left, up = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
-    right, down = np.minimum(left + 1, width - 1), np.minimum(up + 1, height - 1)
-    x, y = (x - left)[..., None].astype(np.float32), (y - up)[..., None].astype(np.float32)
-    opaque = channels != 4 or bool((image[..., 3] == 255).all())
-    total = np.zeros((*u.shape, channels), np.float32)
-    for row, col, weight in (
-        (up, left, (1 - y) * (1 - x)),
-        (up, right, (1 - y) * x),
-        (down, left, y * (1 - x)),
-        (down, right, y * x),
-    ):
-        at = image[row, col].astype(np.float32)
-        if not opaque:
-            weight = weight * np.concatenate([np.repeat(at[..., 3:], 3, -1) / 255, np.ones_like(at[..., 3:])], -1)
-        total += weight * at
-    if not opaque:
-        total[..., :3] /= np.maximum(total[..., 3:] / 255, 1e-6)
-    return np.clip(np.rint(total), 0, 255).astype(np.uint8)
+def sample(image: np.ndarray, taps: Taps) -> np.ndarray:
+    """image (H,W,4) uint8 RGBA between its pixels -> (…,4) uint8, bilinear; colours are weighted by alpha."""
+    out = np.empty((*taps.corner.shape, 4), np.uint8)
+    if (image[..., 3] == 255).all():
+        out[..., 3] = 255
+        for c in range(3):
+            out[..., c] = np.rint(taps.of(image[..., c]))
+        return out
+    share = image[..., 3].astype(np.float32) / 255
+    alpha = taps.of(share)
+    for c in range(3):
+        out[..., c] = np.rint(np.minimum(taps.of(image[..., c] * share) / np.maximum(alpha, 1e-6), 255))
+    out[..., 3] = np.rint(255 * alpha)
+    return out

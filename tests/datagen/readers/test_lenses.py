@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from timesplat.datagen.readers.lenses import Lens, sample, straighten
+from timesplat.datagen.readers.lenses import Lens, Taps, sample, straighten
 
 from .worlds import inverse
 
@@ -47,8 +47,8 @@ def test_a_picture_comes_out_straight(k1, k2, p1, p2, fisheye):
         return np.stack([128 + 100 * np.sin(3 * x), 128 + 100 * np.cos(3 * y), 128 + 80 * np.sin(2 * x + 2 * y)], -1)
 
     v, u = np.meshgrid(np.arange(40) + 0.5, np.arange(48) + 0.5, indexing="ij")
-    taken = np.rint(pattern(*inverse(lens, u, v))).astype(np.uint8)
-    got = straighten(taken, lens).astype(float)
+    taken = np.dstack([np.rint(pattern(*inverse(lens, u, v))).astype(np.uint8), np.full((40, 48), 255, np.uint8)])
+    got = straighten(taken, lens)[..., :3].astype(float)
     x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     at = lens.pixels(x, y)
     within = (at[0] > 1) & (at[0] < 47) & (at[1] > 1) & (at[1] < 39)
@@ -71,11 +71,15 @@ def test_where_the_model_turns_back_nothing_is_seen():
 
 
 def test_sampled_between_pixels_and_weighted_by_alpha():
-    image = np.array([[[200, 0, 0, 255], [0, 0, 0, 0]]], np.uint8)
-    half = sample(image, np.array([1.0]), np.array([0.5]))
-    assert half.tolist() == [[200, 0, 0, 128]]  # the colour of what is transparent does not count
-    assert sample(image[..., :3], np.array([1.0]), np.array([0.5])).tolist() == [[100, 0, 0]]
-    assert sample(image, np.array([-9.0, 9.0]), np.array([9.0, -9.0])).tolist() == [[200, 0, 0, 255], [0, 0, 0, 0]]
+    image = np.array([[[200, 0, 0, 255], [0, 0, 0, 0]]] * 2, np.uint8)
+
+    def at(u, v, picture=image):
+        return sample(picture, Taps.at(np.array(u), np.array(v), 2, 2)).tolist()
+
+    assert at([1.0], [0.5]) == [[200, 0, 0, 128]]  # the colour of what is transparent does not count
+    assert at([-9.0, 9.0], [9.0, -9.0]) == [[200, 0, 0, 255], [0, 0, 0, 0]]
+    opaque = image | np.array([0, 0, 0, 255], np.uint8)
+    assert at([1.0, 0.75, 1.5], [0.5, 1.0, 1.5], opaque) == [[100, 0, 0, 255], [150, 0, 0, 255], [0, 0, 0, 255]]
 
 
 def test_resized():
