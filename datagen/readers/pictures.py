@@ -53,16 +53,12 @@ class Pictures:
     def alpha(self, view: View, size: int) -> np.ndarray:
         """(h,w) float32 0..1: alpha of a view at `size` pixels of the longer side, without the picture where its mask
         says all."""
-        from PIL import Image
-
         source = self.sources[view.image]
         if source.mask and source.lens.straight:
             alpha = self._fit(read_mask(source.mask, self.remedy)[..., None], source.lens)[..., 0]
         else:
             alpha = self(view)[..., 3]
-        scale = size / max(alpha.shape)
-        small = (max(round(alpha.shape[1] * scale), 1), max(round(alpha.shape[0] * scale), 1))
-        return np.asarray(Image.fromarray(alpha).resize(small, Image.Resampling.BOX), np.float32) / 255
+        return shrunk(alpha, size)
 
     def _rgba(self, source: Source) -> np.ndarray:
         rgba = read_picture(source.image, source.upright, self.remedy)
@@ -97,6 +93,15 @@ class Pictures:
         picture = Image.fromarray(padded[..., 0] if kind == "L" else padded, kind)  # RGBA is resized premultiplied
         out = picture.resize((self.width, self.height), Image.Resampling.BILINEAR, box=tuple(box + pad))
         return np.asarray(out).reshape(self.height, self.width, image.shape[2])
+
+
+def shrunk(alpha: np.ndarray, size: int) -> np.ndarray:
+    """(H,W) uint8 -> (h,w) float32 0..1 with `size` pixels at the longer side, averaged."""
+    from PIL import Image
+
+    scale = size / max(alpha.shape)
+    small = (max(round(alpha.shape[1] * scale), 1), max(round(alpha.shape[0] * scale), 1))
+    return np.asarray(Image.fromarray(alpha).resize(small, Image.Resampling.BOX), np.float32) / 255
 
 
 def read_picture(path: Path, upright: bool, remedy: str) -> np.ndarray:

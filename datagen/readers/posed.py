@@ -13,15 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..sequence import InputError, Normalisation, Sequence, View, check_sequence, opengl_to_opencv
-from . import volume
+from ..sequence import InputError, Sequence, View, check_sequence
 from .lenses import Lens
 from .options import AXES, ReadOptions
 from .pictures import Pictures, Source, background_of, scaled_to, size_of
+from .placing import place
 from .times import clip_of, of_names
 
 REMEDY = "correct it, or get the data set again"
-HELD_OUT = ("val", "target")
 
 
 @dataclass
@@ -58,6 +57,13 @@ class PosedScene:
 def assemble(scene: PosedScene, options: ReadOptions) -> Sequence:
     """The scene as a Sequence, whose pictures are read when they are asked for. Raises InputError naming the file and
     the fault, see the tests of what is refused."""
+    seq = arrange(scene, options)
+    place(seq, scene.points, options, scene.path)
+    return seq
+
+
+def arrange(scene: PosedScene, options: ReadOptions) -> Sequence:
+    """The same in the cameras' own world, before it is known where the object is. Raises InputError."""
     if not scene.pictures:
         raise InputError(f"{scene.path}: it has no pictures; {REMEDY}.")
     sources, has_alpha, masked = _sources(scene)
@@ -84,10 +90,6 @@ def assemble(scene: PosedScene, options: ReadOptions) -> Sequence:
         c2w = _checked(p, scene, read)
         seq.views.append(View(frame, camera, p.rig, c2w, fx, fy, cx, cy, p.image))
     check_sequence(seq, scene.path)
-    seq.normalisation, where, seq.aabb = _volume(scene, seq, pictures, options)
-    told.append(where)
-    for v in seq.views:
-        v.c2w = seq.normalisation.from_world(v.c2w)
     seq.provenance = {"asset": scene.folder.absolute().name, "format": scene.layout, **scene.provenance, "read": told}
     return seq
 
@@ -163,79 +165,3 @@ def _checked(p: Posed, scene: PosedScene, read) -> np.ndarray:
     if np.linalg.det(c2w[:3, :3]) < 0:
         raise InputError(f"{scene.path}: the camera of {p.image} is left-handed; pass --axes left-handed.")
     return np.asarray(c2w, np.float64)
-
-
-def silhouettes_of(seq: Sequence, pictures: Pictures) -> volume.Silhouettes:
-    """Small masks of some views that are not held out, spread over the clip."""
-    inputs = [i for i, v in enumerate(seq.views) if v.rig not in HELD_OUT] or list(range(len(seq.views)))
-    windows = volume.chosen_views(np.array([seq.views[i].frame for i in inputs]))
-    views = [inputs[k] for window in windows for k in window]
-    masks = np.stack([pictures.alpha(seq.views[i], volume.SIDE) > 0.5 for i in views])
-    shrink = np.array([masks.shape[2] / seq.width, masks.shape[1] / seq.height] * 2)
-    c2w = opengl_to_opencv(np.stack([seq.views[i].c2w for i in views]))
-    intrinsics = np.array([[v.fx, v.fy, v.cx, v.cy] for v in (seq.views[i] for i in views)]) * shrink
-    return volume.Silhouettes(masks, c2w, intrinsics, np.repeat(np.arange(len(windows)), [len(w) for w in windows]))
-
-
-def _volume(
-    scene: PosedScene, seq: Sequence, pictures: Pictures, options: ReadOptions
-) -> tuple[Normalisation, str, list]:
-    """What leads from the unit box back to the cameras' world, in words where it is from, and the object's box."""
-    cut = pictures.has_alpha or pictures.background is not None
-    unit = [[-1, -1, -1], [1, 1, 1]]
-    place = np.array([v.c2w[:3, 3] for v in seq.views])
-    axis = np.array([-v.c2w[:3, 2] for v in seq.views])
-    slope = np.array([min(seq.width / v.fx, seq.height / v.fy) / 2 for v in seq.views])
-    if options.aabb:
-        low, high = np.array(options.aabb[:3]), np.array(options.aabb[3:])
-        norm = volume.normalisation_around(low, high)
-        return norm, _where(norm, "the box that --aabb says"), _box(norm, low, high)
-    if cut:
-        sil = silhouettes_of(seq, pictures)
-        if not sil.masks.any():
-            raise InputError(
-                f"{scene.path}: no picture shows anything of an object; check the masks or the background."
-            )
-        box = volume.box_of(sil)
-        if box is None:
-            raise InputError(
-                f"{scene.path}: its cameras do not look at one object: the silhouettes have no place in common; "
-                "`timesplat inspect` says whether another reading of the axes fits."
-            )
-        low, high, points = box
-        norm = volume.normalisation_around(low, high, points)
-        if options.scale:
-            norm = Normalisation(options.scale, norm.translation)
-            return norm, _where(norm, "as large as --scale says, around the silhouettes"), _box(norm, low, high)
-        return norm, _where(norm, f"the visual hull of {len(sil.masks)} silhouettes"), _box(norm, low, high)
-    norm = volume.normalisation_of_views(place, axis, slope, scene.path)
-    if options.scale:
-        norm = Normalisation(options.scale, norm.translation)
-        return norm, _where(norm, "as large as --scale says, around what the cameras look at"), unit
-    if scene.points is not None and len(scene.points):
-        sil = volume.Silhouettes(
-            np.broadcast_to(np.array(True), (len(seq.views), seq.height, seq.width)),
-            opengl_to_opencv(np.stack([v.c2w for v in seq.views])),
-            np.array([[v.fx, v.fy, v.cx, v.cy] for v in seq.views]),
-            np.zeros(len(seq.views), int),
-        )
-        centre = np.array(norm.translation)
-        reach = float(np.median(np.linalg.norm(place - centre, axis=1)))
-        if seen := volume.bounds_of_points(scene.points, sil, reach, centre):
-            norm = volume.normalisation_around(*seen)
-            return (
-                norm,
-                _where(norm, f"the points that half of the cameras see, of {len(scene.points)}"),
-                _box(norm, *seen),
-            )
-    return norm, _where(norm, "what the cameras look at together"), unit
-
-
-def _where(norm: Normalisation, how: str) -> str:
-    x, y, z = norm.translation
-    return f"volume: {how}; ±{norm.scale:.4g} around ({x:.4g}, {y:.4g}, {z:.4g})"
-
-
-def _box(norm: Normalisation, low: np.ndarray, high: np.ndarray) -> list:
-    t = np.array(norm.translation)
-    return [((low - t) / norm.scale).tolist(), ((high - t) / norm.scale).tolist()]

@@ -169,19 +169,29 @@ def _largest_slope(sil: Silhouettes) -> float:
     return float(np.median(found))
 
 
-def box_of(sil: Silhouettes) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The corners (3,), (3,) of the box that holds the object, and points (P,3) of its surface and inside; None where
-    the silhouettes have no place in common. Of what moves while a camera goes around it silhouettes cut too much away:
-    the box is as large as what the masks show at its distance."""
+@dataclass(frozen=True)
+class Box:
+    """What holds the object."""
+
+    low: np.ndarray  # (3,)
+    high: np.ndarray  # (3,)
+    points: np.ndarray  # (P,3) on its surface and inside
+    agreement: np.ndarray  # (V,) see `agreement`
+
+
+def box_of(sil: Silhouettes) -> Box | None:
+    """None where the silhouettes have no place in common. Of what moves while a camera goes around it they cut too much
+    away: the box is as large as what the masks show at its distance."""
     hull = hull_of(sil)
     if hull is None:
         return None
+    fit = agreement(sil, hull)
     low, high = hull.bounds()
     points, centre = hull.occupied, (low + high) / 2
     grow = reach(sil, centre) / (np.linalg.norm(points - centre, axis=1).max() + np.linalg.norm(high - low) / GRID)
     if grow > 1:
         low, high, points = (centre + grow * (x - centre) for x in (low, high, points))
-    return low, high, points
+    return Box(low, high, points, fit)
 
 
 def reach(sil: Silhouettes, centre: np.ndarray) -> float:

@@ -259,7 +259,7 @@ def test_without_anything_that_tells_the_object(tmp_path, taken):
     write_colmap(tmp_path, taken, [f"{k:04d}.png" for k in range(12)], points=rows)
     found = open_sequence(tmp_path)
     assert found.normalisation.translation == pytest.approx((0.2, 0.2, 0.2), abs=0.01)
-    assert any("points that half of the cameras see, of 125" in x for x in found.provenance["read"])
+    assert any("what half of the cameras see of 125 points" in x for x in found.provenance["read"])
 
 
 def test_pictures_smaller_than_stated(tmp_path, taken, truth):
