@@ -72,6 +72,60 @@ def _main(argv: list[str] | None) -> int:
     return exit_code("timesplat", lambda: args.run(args))
 
 
+# ---------------------------------------------------------------- inspect, import
+
+
+def inspect_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.readers.options import add_arguments
+
+    p.add_argument("folder", type=Path, help="pictures with cameras: a Sequence, or a folder of D-NeRF, nerfstudio, "
+                   "instant-ngp, COLMAP or Panoptic")  # fmt: skip
+    p.add_argument("--out", type=Path, help=".png to draw, of the cameras, the volume and the pictures over time "
+                   "(default: inspect-FOLDER.png here)")  # fmt: skip
+    add_arguments(p)
+
+
+def inspect(args: argparse.Namespace) -> int:
+    """Say what a folder of pictures and cameras holds: how many, whether the cameras agree, in which reading of their
+    axes, what they see of the object, what is repeated, blurred or missing; and draw one picture of it."""
+    from .datagen.inspection import inspect as run
+    from .datagen.readers.options import from_arguments
+
+    found = run(args.folder, from_arguments(args))
+    for line in found.lines:
+        print(line)
+    from .evaluation.inspection_picture import write_picture
+
+    out = args.out or Path(f"inspect-{args.folder.absolute().name}.png")
+    write_picture(out, found.seq, found.lines)
+    print(out)
+    return 0
+
+
+def import_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.readers.options import add_arguments
+
+    p.add_argument("folder", type=Path, help="of D-NeRF, nerfstudio, instant-ngp, COLMAP or Panoptic")
+    p.add_argument("--out", type=Path, required=True, help="folder of the Sequence to write")
+    add_arguments(p)
+
+
+def import_(args: argparse.Namespace) -> int:
+    """Write others' pictures and cameras as a Sequence: one size, straight lines, alpha, a normalised world."""
+    from .datagen.importing import import_sequence
+    from .datagen.inspection import counts
+    from .datagen.readers import open_sequence
+    from .datagen.readers.options import from_arguments
+
+    seq = open_sequence(args.folder, from_arguments(args))
+    for line in [counts(seq), *seq.provenance.get("read", [])[1:]]:
+        print(line)
+    with _bar() as progress:
+        written = import_sequence(seq, args.out, progress)
+    print(f"{args.out}: {len(written.views)} pictures")
+    return 0
+
+
 # ---------------------------------------------------------------- render
 
 
@@ -170,8 +224,11 @@ def reconstruct(args: argparse.Namespace) -> int:
         max_loss=args.max_loss,
     )
     seq = open_sequence(args.sequence, from_arguments(args))
-    for line in seq.provenance.get("read", []):
-        print(line)
+    if "read" in seq.provenance:  # of others' data, in two lines; `inspect` says more
+        from .datagen.inspection import counts
+
+        print(counts(seq))
+        print("; ".join(seq.provenance["read"][1:]))
     rigs = sorted({v.rig for v in seq.views})
     if args.rig and args.rig not in rigs:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
@@ -407,6 +464,8 @@ def extension(args: argparse.Namespace) -> int:
 COMMANDS = {
     "demo": (demo_arguments, demo, "the whole road in one go, with pictures"),
     "render": (render_arguments, render, "assets to Sequences (Blender)"),
+    "inspect": (inspect_arguments, inspect, "what others' pictures and cameras are"),
+    "import": (import_arguments, import_, "others' pictures to a Sequence"),
     "reconstruct": (reconstruct_arguments, reconstruct, "a Sequence to a 4D Gaussian asset"),
     "export": (export_arguments, export, "an asset to USD, a web page or .blend"),
     "view": (view_arguments, view, "play an asset in the browser"),

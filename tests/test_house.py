@@ -51,7 +51,7 @@ LAYERS = {
             "evaluation.differences",
         ),
         ("evaluation.study_scores",),
-        ("evaluation.studies", "evaluation.contact_sheet"),
+        ("evaluation.studies", "evaluation.contact_sheet", "evaluation.inspection_picture"),
     ),
     "addon": (
         ("addon.asset",),
@@ -68,6 +68,7 @@ LAYERS = {
         ("datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
         ("datagen.sequence",),
         ("datagen.readers",),
+        ("datagen.inspection", "datagen.importing"),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.render_setup", "datagen.tracks"),
         ("datagen.capture",),

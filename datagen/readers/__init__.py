@@ -11,13 +11,15 @@ from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from ..sequence import FORMAT, InputError, Sequence, read_sequence
 from .colmap import model_folder, read_colmap
 from .dnerf import SPLITS, read_dnerf
 from .options import ReadOptions
 from .panoptic import SPLITS as META_SPLITS
 from .panoptic import read_panoptic
-from .posed import PosedScene, assemble
+from .posed import PosedScene, arrange, assemble
 from .transforms import read_transforms
 
 OURS, DNERF, PANOPTIC = "transforms.json", "transforms_train.json", "train_meta.json"
@@ -53,7 +55,8 @@ def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
         return copy.deepcopy(_assembled(folder.absolute(), stamps, options))
     told = [f"--{f.name}" for f in fields(options) if getattr(options, f.name) != f.default]
     ours = (folder / OURS).is_file()
-    if told and (ours or told != ["--background"]) and (ours or (folder / DNERF).is_file()):
+    told = [name for name in told if ours or name not in ("--background", "--axes")]
+    if told and (ours or (folder / DNERF).is_file()):
         raise InputError(f"{folder}: {told[0]} is for layouts that leave it open; this one says it itself.")
     if ours:
         return read_sequence(folder)
@@ -63,6 +66,18 @@ def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
         f"{folder / OURS}: no such file, nor {DNERF}, {PANOPTIC} or COLMAP's sparse/0; give a folder that `timesplat "
         "render` wrote, or one of D-NeRF, nerfstudio, instant-ngp, COLMAP or Panoptic."
     )
+
+
+def arranged(folder: Path, options: ReadOptions = DEFAULTS) -> tuple[Sequence, list[np.ndarray] | None, str]:
+    """The Sequence in a folder before it is known where the object is, with the cameras' matrices (4,4) as they are
+    written, and the convention that they are read in; None for ours, whose convention is known. Raises InputError."""
+    if layout := _layout(Path(folder)):
+        scene = layout.read(Path(folder))
+        return arrange(scene, options), [p.matrix for p in scene.pictures], options.axes or scene.axes
+    if (Path(folder) / OURS).is_file() or not (Path(folder) / DNERF).is_file():
+        return open_sequence(folder, options), None, "opengl"
+    seq = read_dnerf(Path(folder), options, normalised=False)
+    return seq, None if options.axes else [v.c2w for v in seq.views], options.axes or "opengl"
 
 
 @lru_cache(maxsize=8)

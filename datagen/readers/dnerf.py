@@ -25,7 +25,7 @@ from ..sequence import (
     read_from,
 )
 from .lenses import Lens
-from .options import ReadOptions
+from .options import AXES, ReadOptions
 from .pictures import Pictures, Source, background_of, size_of
 from .volume import normalisation_of_views
 
@@ -33,13 +33,15 @@ SPLITS = {"train": "train", "val": "val", "test": "target"}  # the rig of each
 FPS = 24.0  # the format has no rate
 SUFFIXES = ("", ".png")  # that are tried, in this order
 REMEDY = "correct it, or get the data set again"
+FOUND_OUT = ReadOptions()
 SNAP = 1e-3  # frames: as much rounding of a printed time is taken back
 
 
-def read_dnerf(folder: Path, options: ReadOptions | None = None) -> Sequence:
+def read_dnerf(folder: Path, options: ReadOptions = FOUND_OUT, normalised: bool = True) -> Sequence:
     """Reads and checks the scene in a folder; pictures are read later, but that they exist is checked now. Its clip has
     as many frames as there are distinct times of train views; times between them are fractions of a frame. It is
-    normalised by its cameras, see `normalisation_of`. Pictures without alpha have a background, measured or told.
+    normalised by its cameras, see `normalisation_of`, unless it shall not be. Pictures without alpha have a background,
+    measured or told.
 
     Raises InputError naming the file and the fault: missing or damaged JSON, no camera_angle_x, a missing picture, a
     camera that is not a rigid finite transform, a time that is not within 0..1, cameras that do not look at one place.
@@ -58,18 +60,20 @@ def read_dnerf(folder: Path, options: ReadOptions | None = None) -> Sequence:
     for split, d in data.items():
         with read_from(files[split], REMEDY):
             views = [_view(seq, split, n, d, f, moving) for n, f in enumerate(d["frames"])]
+            for v in views:
+                v.c2w = AXES[options.axes or "opengl"](v.c2w)
         check_sequence(replace(seq, views=views), files[split])
         seq.views += views
-    seq.normalisation = normalisation_of([v for v in seq.views if v.rig == "train"], width, height, files["train"])
-    for v in seq.views:
-        v.c2w = seq.normalisation.from_world(v.c2w)
+    if normalised:
+        seq.normalisation = normalisation_of([v for v in seq.views if v.rig == "train"], width, height, files["train"])
+        for v in seq.views:
+            v.c2w = seq.normalisation.from_world(v.c2w)
     if not size_of(folder / seq.views[0].image, True, REMEDY)[2]:
         lenses = {v.image: Lens(width, height, v.fx, v.fy, v.cx, v.cy) for v in seq.views}
         sources = {name: Source(folder / name, None, lens) for name, lens in lenses.items()}
-        asked = options.background if options else "auto"
-        background, told = background_of(list(sources.values()), False, False, asked, REMEDY)
+        background, told = background_of(list(sources.values()), False, False, options.background, REMEDY)
         seq.picture = Pictures(sources, background, False, REMEDY)
-        seq.provenance["read"] = [told]
+        seq.provenance["read"] = ["D-NeRF", told]
     return seq
 
 

@@ -165,7 +165,7 @@ def test_pictures_on_white_in_the_format_of_d_nerf(write_dnerf):
     for path in folder.rglob("*.png"):
         Image.fromarray(picture).save(path)
     seq = open_sequence(folder)
-    assert (seq.load_image(2)[..., 3] > 0).sum() == 1 and "#ffffff" in seq.provenance["read"][0]
+    assert (seq.load_image(2)[..., 3] > 0).sum() == 1 and "#ffffff" in seq.provenance["read"][1]
     black = open_sequence(folder, ReadOptions(background="black")).load_image(2)
     assert (black[..., 3] == 255).all()
 
