@@ -61,7 +61,12 @@ def inspect(folder: Path, options: ReadOptions) -> Inspection:
             raise
         seq, placed = world, False
     return Inspection(
-        seq, counts(seq), agreement(seq), advice, [*lying(seq), *repeated(seq), *gaps(seq), *light(seq)], placed
+        seq,
+        counts(seq),
+        agreement(seq),
+        advice,
+        [*(lying(seq) if placed else []), *repeated(seq), *gaps(seq), *light(seq)],
+        placed,
     )
 
 

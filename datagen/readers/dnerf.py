@@ -68,12 +68,13 @@ def read_dnerf(folder: Path, options: ReadOptions = FOUND_OUT, normalised: bool 
         seq.normalisation = normalisation_of([v for v in seq.views if v.rig == "train"], width, height, files["train"])
         for v in seq.views:
             v.c2w = seq.normalisation.from_world(v.c2w)
+    told = "alpha says what is the object"
     if not size_of(folder / seq.views[0].image, True, REMEDY)[2]:
         lenses = {v.image: Lens(width, height, v.fx, v.fy, v.cx, v.cy) for v in seq.views}
         sources = {name: Source(folder / name, None, lens) for name, lens in lenses.items()}
         background, told = background_of(list(sources.values()), False, False, options.background, REMEDY)
         seq.picture = Pictures(sources, background, False, REMEDY)
-        seq.provenance["read"] = ["D-NeRF", told]
+    seq.provenance["read"] = ["D-NeRF", told, "volume: what the cameras look at together"]
     return seq
 
 
