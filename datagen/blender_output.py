@@ -12,6 +12,10 @@ from .image_files import read_exr
 from .passes import Passes
 
 BACKGROUND_DEPTH = 1e9  # Blender writes 1e10 where a pixel's depth sample met nothing
+# Alpha from which a surface gives a pixel its depth whatever lies behind, and where nothing does. Blender's own measure
+# is one half, below which rays draw lots: the lift of boxes of alpha 0.4 has 19.6 dB at one half and 22.0 at 0.2; that
+# of a thing inside of a ball of alpha 0.1 has 21.6 dB at 0.2 and 15.4 at 0.02.
+SEEN, FAINTEST = 0.2, 0.02
 
 
 def read_multilayer(path: Path) -> dict[str, np.ndarray]:
@@ -45,3 +49,25 @@ def to_straight_srgb(linear: np.ndarray) -> np.ndarray:
     rgba = np.round(np.concatenate([rgb, alpha], -1) * 255).astype(np.uint8)
     rgba[rgba[..., 3] == 0] = 0
     return rgba
+
+
+def _without_depth(channels: dict[str, np.ndarray]) -> np.ndarray:
+    """(H,W) bool: pixels that show something, and no depth of it."""
+    return (channels["z"] >= BACKGROUND_DEPTH) & (channels["combined"][..., 3] > FAINTEST)
+
+
+def shows_faint_surfaces(channels: dict[str, np.ndarray]) -> bool:
+    """Whether an area without depth shows something: a pixel and all its neighbours, which no silhouette is."""
+    area = _without_depth(channels)
+    for axis in (0, 1):
+        area = area & np.roll(area, 1, axis) & np.roll(area, -1, axis)
+    return bool(area[1:-1, 1:-1].any())
+
+
+def fill_faint_surfaces(channels: dict[str, np.ndarray], faint: dict[str, np.ndarray]) -> None:
+    """Gives `channels` depth and motion of `faint`, the same view rendered so that faint surfaces have them, where they
+    have none, or show that surface and have no motion of it."""
+    fill = _without_depth(channels) | np.isclose(channels["z"], faint["z"], rtol=1e-4)
+    fill &= faint["z"] < BACKGROUND_DEPTH
+    for name in ("z", "vector"):
+        channels[name][fill] = faint[name][fill]

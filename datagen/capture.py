@@ -21,10 +21,23 @@ import bpy
 import numpy as np
 
 from . import displace
-from .blender_output import read_multilayer, to_passes, to_straight_srgb
+from .blender_output import (
+    fill_faint_surfaces,
+    read_multilayer,
+    shows_faint_surfaces,
+    to_passes,
+    to_straight_srgb,
+)
 from .image_files import write_png
 from .passes import Passes, write_passes
-from .render_setup import CaptureSettings, MultiViewCameras, add_even_light, apply_settings, temporary_data
+from .render_setup import (
+    CaptureSettings,
+    MultiViewCameras,
+    add_even_light,
+    apply_settings,
+    faint_surfaces_have_depth,
+    temporary_data,
+)
 from .rigs import Shot
 from .scene.borrow import borrowed
 from .sequence import (
@@ -50,6 +63,7 @@ class Subject:
     aabb            (2,3) the box over all frames, normalised; None = the whole of [-1,1]
     objects         Blender objects that the cameras see; None = all that the scene shows to renders
     shift           (F,3) normalised: show the scene moved by this at each frame of the clip (`displace`)
+    unit            the open scene is so many times as large as what the Sequence's normalisation leads back to
     """
 
     frames: list[int]
@@ -57,6 +71,7 @@ class Subject:
     aabb: np.ndarray | None = None
     objects: list | None = None
     shift: np.ndarray | None = None
+    unit: float = 1.0
 
 
 def capture(
@@ -66,12 +81,14 @@ def capture(
     settings: CaptureSettings | None = None,
     *,
     provenance: dict | None = None,
+    refuse_empty: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Sequence:
     """Renders `shots` of the open scene and writes the Sequence `out`; returns it as read back.
 
     shots           cameras in normalised space; `Shot.frame` counts the clip's frames, 0…len(subject.frames)-1
     provenance      what the Sequence says of where it came from
+    refuse_empty    pictures of which none shows anything are an InputError
     progress        called with (images done, images in all) after every frame
 
     Motion vectors hold for a camera that stands still, and for one step of `subject.frames`: where two entries
@@ -101,15 +118,19 @@ def capture(
             if settings.lighting:
                 add_even_light(stage, temporary)
             cameras = MultiViewCameras(stage, temporary, subject.normalisation)
-            done = 0
-            for files in _render_frames(cameras, shots, subject, settings, Path(tmp)):
-                for file in files:
+            done, shown = 0, False
+            for frame in _render_frames(cameras, shots, subject, settings, Path(tmp)):
+                for channels in frame:
                     view = seq.views[done]
-                    _write_view(
-                        view, f"{names[view.rig, view.camera]}_{int(view.frame):04d}", file, folder, subject, settings
-                    )
+                    name = f"{names[view.rig, view.camera]}_{int(view.frame):04d}"
+                    shown |= _write_view(view, name, channels, folder, subject, settings)
                     done += 1
                 progress(done, len(shots))
+            if refuse_empty and not shown:
+                raise InputError(
+                    f"{out}: no picture shows anything, for what is there is transparent or out of sight; look at its "
+                    "materials and visibility."
+                )
 
     return write_sequence(seq, out, fill)
 
@@ -133,18 +154,24 @@ def _sequence_to_fill(
         fps=render.fps / render.fps_base / _scene_frames_per_frame(subject.frames),
         frame_start=0,
         frame_end=len(subject.frames) - 1,
-        normalisation=subject.normalisation,
+        normalisation=_in_units(subject.normalisation, subject.unit),
         aabb=[[-1.0] * 3, [1.0] * 3] if subject.aabb is None else np.asarray(subject.aabb, float).tolist(),
         provenance=dict(provenance or {}),
         views=[_view(shot, width, height) for shot in shots],
     )
 
 
+def _in_units(normalisation: Normalisation, unit: float) -> Normalisation:
+    x, y, z = normalisation.translation
+    return Normalisation(normalisation.scale / unit, (x / unit, y / unit, z / unit))
+
+
 def _render_frames(
     cameras: MultiViewCameras, shots: list[Shot], subject: Subject, settings: CaptureSettings, tmp: Path
-) -> Iterator[list[Path]]:
-    """Renders frame by frame; yields one EXR for each shot of the frame, in the order of `shots`, which lie in `tmp`
-    until the next frame."""
+) -> Iterator[list[dict[str, np.ndarray]]]:
+    """Renders frame by frame; yields the channels (`read_multilayer`) of each shot of the frame, in the order of
+    `shots`. What is all but transparent and has nothing behind it is rendered once more, by one sample, for its depth
+    and motion."""
     if subject.shift is not None:
         shots = displace.counter_moved(shots, subject.shift)
     for frame, group in groupby(shots, key=lambda shot: shot.frame):
@@ -152,21 +179,32 @@ def _render_frames(
         if settings.engine == "CYCLES":
             cameras.stage.cycles.seed = settings.seed + frame
         cameras.place(list(group))
-        yield cameras.render(tmp)
+        channels = [_read(file) for file in cameras.render(tmp)]
+        if settings.passes and settings.engine == "CYCLES" and any(shows_faint_surfaces(c) for c in channels):
+            with faint_surfaces_have_depth(cameras.stage):
+                for c, file in zip(channels, cameras.render(tmp), strict=True):
+                    fill_faint_surfaces(c, _read(file))
+        yield channels
 
 
-def _write_view(
-    view: View, name: str, rendered: Path, folder: Path, subject: Subject, settings: CaptureSettings
-) -> None:
-    """Turns what Blender rendered into the view's files below `folder`, and sets their paths."""
+def _read(rendered: Path) -> dict[str, np.ndarray]:
+    """What Blender rendered. InputError where the file is not whole."""
     try:
-        channels = read_multilayer(rendered)
+        return read_multilayer(rendered)
     except (ValueError, OSError, struct.error, IndexError, KeyError):
         raise InputError(
             f"{rendered.parent}: Blender did not write the picture whole; make space on that disk."
         ) from None
+
+
+def _write_view(
+    view: View, name: str, channels: dict[str, np.ndarray], folder: Path, subject: Subject, settings: CaptureSettings
+) -> bool:
+    """Turns what Blender rendered into the view's files below `folder`, and sets their paths. Whether it shows
+    anything."""
     view.image = f"images/{name}.png"
-    write_png(folder / view.image, to_straight_srgb(channels["combined"]))
+    rgba = to_straight_srgb(channels["combined"])
+    write_png(folder / view.image, rgba)
     if settings.passes:
         view.passes = f"passes/{name}.exr"
         passes = to_passes(channels, subject.normalisation.scale)
@@ -174,6 +212,7 @@ def _write_view(
         if subject.shift is not None:
             displace.add_flow(passes, view, subject.shift)
         write_passes(folder / view.passes, passes, channels["combined"] if settings.linear else None)
+    return bool(rgba[..., 3].any())
 
 
 def _write_tracks(seq: Sequence, folder: Path, subject: Subject, settings: CaptureSettings) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from . import ASSET_SUFFIXES
-from .render_job import ALL_CLIPS, RenderSettings, asset_name, expand_folders, finished_sequences
+from .render_job import ALL_CLIPS, Asset, RenderSettings, finished_sequences, list_assets
 from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
 
@@ -33,22 +33,24 @@ def render_assets(
     out: Path,
     settings: RenderSettings | None = None,
     *,
+    root: Path | None = None,
     jobs: int = 1,
     report: Callable[[str], None] = print,
     progress: Callable[[int, int, int], None] = lambda done, total, images: None,
 ) -> tuple[list[Path], list[str]]:
-    """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<stem>/<clip>`, `jobs` at a time.
+    """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<name>/<clip>`, `jobs` at a time. Names
+    are those of `list_assets`; below `root` (by default the folder given, or a file's own) paths in files may lead.
 
     Returns the folders of all Sequences, those found finished included, and one sentence for each asset that
     failed. `report` gets warnings and failures as they happen, `progress` assets done, in all, and images.
     """
     settings, out = settings or RenderSettings(), Path(out)
-    names = expand_folders(assets)
-    pending, folders, failures = _sort_out(names, out, settings)
+    listed = list_assets(assets, root)
+    pending, folders, failures = _sort_out(listed, out, settings)
     for sentence in failures:
         report(sentence)
-    done, images = len(names) - len(pending), 0
-    progress(done, len(names), images)
+    done, images = len(listed) - len(pending), 0
+    progress(done, len(listed), images)
 
     with _Farm(out, settings, max(1, min(jobs, len(pending)))) as farm:
         for message in farm.render(pending):
@@ -63,19 +65,20 @@ def render_assets(
             else:
                 failures.append(message["error"])
                 report(message["error"])
-            progress(done, len(names), images)
+            progress(done, len(listed), images)
     return folders, failures
 
 
-def _sort_out(names: list[str], out: Path, settings: RenderSettings) -> tuple[list[str], list[Path], list[str]]:
+def _sort_out(assets: list[Asset], out: Path, settings: RenderSettings) -> tuple[list[Asset], list[Path], list[str]]:
     """Assets still to render, folders of Sequences that are finished, and a sentence for each asset that another one
     of the same name would overwrite."""
     pending, finished, failures, seen = [], [], [], {}
-    for asset in names:
-        other = seen.setdefault(asset_name(asset).lower(), asset)  # one folder for both on Windows and macOS
+    for asset in assets:
+        other = seen.setdefault(asset.name.lower(), asset)  # one folder for both on Windows and macOS
         if other != asset:
-            failures.append(f"{asset}: it would be written over that of {other}; rename one of the two.")
-        elif folders := finished_sequences(out / asset_name(asset), asset, settings):
+            remedy = "rename one of the two, or give a --root that holds both, for names are paths below it"
+            failures.append(f"{asset.path}: it would be written over that of {other.path}; {remedy}.")
+        elif folders := finished_sequences(out / asset.name, asset, settings):
             finished += folders
         else:
             pending.append(asset)
@@ -104,7 +107,7 @@ class _Farm:
                 process.kill()
         self.pool.shutdown()
 
-    def render(self, assets: list[str]) -> Iterator[dict | None]:
+    def render(self, assets: list[Asset]) -> Iterator[dict | None]:
         """The messages of all children as they come (see `render_asset`); None once for each asset, its last."""
         for asset in assets:
             self.pool.submit(self._render_one, asset)
@@ -115,11 +118,11 @@ class _Farm:
                 unfinished -= 1
             yield message
 
-    def _render_one(self, asset: str) -> None:
+    def _render_one(self, asset: Asset) -> None:
         own_cores = self.free_cores.get()
-        out, settings = str(self.out / asset_name(asset)), asdict(self.settings)
+        out, settings = str(self.out / asset.name), asdict(self.settings)
         try:
-            job = {"asset": asset, "out": out, "settings": settings, "cores": own_cores}
+            job = {"asset": asdict(asset), "out": out, "settings": settings, "cores": own_cores}
             _run_child(job, self.messages.put, self.running)
         finally:
             self.free_cores.put(own_cores)
@@ -150,7 +153,8 @@ def render_shots(
             images += message["image"]
             progress(images, message["of"])
 
-    job = {"asset": str(asset), "folder": str(folder), "settings": asdict(settings), "cores": []}
+    (one,) = list_assets([str(asset)])
+    job = {"asset": asdict(one), "folder": str(folder), "settings": asdict(settings), "cores": []}
     _run_child(job, receive, set())
     if errors:
         raise InputError(errors[0])
@@ -200,7 +204,9 @@ def _run_child(job: dict, receive: Callable[[dict], None], running: set[subproce
             reason = f"signal {-code}" if code < 0 else f"exit code {code}"
             lines = log.read_text("utf-8", errors="replace").strip().splitlines() if log.exists() else []
             last = f", last line: {lines[-1][:200]}" if lines else ""
-            receive({"error": f"{job['asset']}: Blender died on it ({reason}{last}); repair or leave out the file."})
+            receive(
+                {"error": f"{job['asset']['path']}: Blender died on it ({reason}{last}); repair or leave out the file."}
+            )
 
 
 # ---------------------------------------------------------------- the command line
@@ -211,6 +217,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = RenderSettings()
     parser.add_argument("assets", nargs="*", metavar="ASSET", help=f"files or folders: {' '.join(ASSET_SUFFIXES)}")
     parser.add_argument("--out", required=True, type=Path, help="folder for the Sequences")
+    parser.add_argument("--root", type=Path, metavar="FOLDER", help="paths in files may lead below it, and names "
+                        "are the paths below it (default: the folder given; a file's own)")  # fmt: skip
     parser.add_argument("--zoo", metavar="SEEDS", help="also procedural objects, for example 0-99 or 3,7,10-12")
     parser.add_argument("--rig", default=defaults.rig, choices=list(RIGS), help="cameras (default: %(default)s)")
     parser.add_argument("--targets", type=int, default=defaults.targets, metavar="N", help="held-out views a frame")
@@ -244,7 +252,9 @@ def run(args: argparse.Namespace) -> int:
         def report(sentence: str) -> None:
             bar.write(sentence, file=sys.stderr)
 
-        folders, failures = render_assets(assets, args.out, settings, jobs=args.jobs, report=report, progress=progress)
+        folders, failures = render_assets(
+            assets, args.out, settings, root=args.root, jobs=args.jobs, report=report, progress=progress
+        )
     print(f"{len(folders)} sequences in {args.out}" + (f", {len(failures)} failed" if failures else ""))
     return 2 if failures else 0
 

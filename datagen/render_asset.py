@@ -21,20 +21,20 @@ from .render_job import (
     ALL_CLIPS,
     FIRST_CLIP,
     MOST_MOVING_CLIP,
+    Asset,
     RenderSettings,
-    asset_name,
     rendered_clips,
     zoo_seed,
 )
 from .rigs import RIGS, targets
-from .sequence import InputError, distinct
+from .sequence import InputError, Normalisation, distinct
 
 
 def run_job(job: dict, send: Callable[[dict], None]) -> None:
-    """Opens the asset and renders each of its clips that the settings choose. `job`: "asset" (a file or "zoo:SEED"),
+    """Opens the asset and renders each of its clips that the settings choose. `job`: "asset" (Asset as a dict),
     "settings" (RenderSettings as a dict), and "out" (a folder for a folder a clip) or "folder" (that of the one clip).
     Raises InputError."""
-    settings, asset = RenderSettings(**job["settings"]), job["asset"]
+    settings, asset = RenderSettings(**job["settings"]), Asset(**job["asset"])
     opened, provenance = _open(asset)
     for warning in opened.warnings:
         send({"warning": warning})
@@ -50,32 +50,31 @@ def run_job(job: dict, send: Callable[[dict], None]) -> None:
         send({"written": str(folder)})
 
 
-def _open(asset: str):
+def _open(asset: Asset):
     """The OpenedAsset, and the beginning of its Sequences' provenance."""
     from .scene.clips import Clip
     from .scene.open import OpenedAsset, empty_session, open_asset, tool_versions
 
-    provenance: dict = {"asset": Path(asset).name, **tool_versions()}
-    if seed := zoo_seed(asset):
+    provenance: dict = {"asset": Path(asset.path).name, **tool_versions()}
+    if seed := zoo_seed(asset.path):
         from .zoo.build import build_object
         from .zoo.puppet import FRAMES
 
         empty_session()
         provenance["zoo"] = build_object(int(seed))
-        return OpenedAsset(Path(asset), "", [Clip("zoo", 1, FRAMES)]), provenance
-    opened = open_asset(Path(asset))
-    provenance["sha256"] = opened.sha256
+        return OpenedAsset(Path(asset.path), "", [Clip("zoo", 1, FRAMES)]), provenance
+    opened = open_asset(Path(asset.path), Path(asset.root) if asset.root else None)
+    provenance |= {"path": asset.below_root, "sha256": opened.sha256}
     return opened, provenance
 
 
 def _render_clip(
-    clip, asset: str, folder: Path, settings: RenderSettings, provenance: dict, send: Callable[[dict], None]
+    clip, asset: Asset, folder: Path, settings: RenderSettings, provenance: dict, send: Callable[[dict], None]
 ) -> None:
     """Renders the clip that the open scene plays into the Sequence `folder`."""
-    from .capture import Subject, capture
-    from .displace import displacements
-    from .render_setup import CaptureSettings
-    from .scene.measure import normalisation
+    from .scene.clips import changes_looks
+    from .scene.measure import holds_still, normalisation
+    from .scene.rescale import LARGEST, SMALLEST, rescaled
     from .scene.simulate import simulate
 
     frames = clip.frames(settings.frames)
@@ -83,9 +82,42 @@ def _render_clip(
         frames = frames[:1] * settings.frames
     if not clip.actions:
         simulate(frames[-1])
-    norm, aabb = normalisation(frames, name=asset)
+    warnings = list(provenance["warnings"])
+    if clip.frame_end > clip.frame_start and not settings.displace and not changes_looks(clip) and holds_still(frames):
+        span = f"{frames[0]:g} to {frames[-1]:g}"
+        warnings.append(f"{asset.path}: nothing moves in frames {span} of the clip {clip.name}; choose another.")
+        send({"warning": warnings[-1]})
     # every clip of every object gets cameras of its own
-    seed = zlib.crc32(f"{settings.seed}/{asset_name(asset)}/{clip.name}".encode())
+    seed = zlib.crc32(f"{settings.seed}/{asset.name}/{clip.name}".encode())
+    provenance = provenance | {"warnings": warnings, "clip": clip.name, "scene_frames": frames, "cameras_seed": seed}
+    norm, aabb = normalisation(frames, name=asset.path)
+    if SMALLEST <= norm.scale <= LARGEST:
+        _capture(frames, norm, aabb, 1.0, seed, folder, settings, provenance, send)
+        return
+    unit = 1 / norm.scale
+    with rescaled(unit):
+        norm, aabb = normalisation(frames, name=asset.path)
+        if not SMALLEST <= norm.scale <= LARGEST:
+            raise InputError(f"{asset.path}: it is too small or too large to be rendered; scale it by {unit:.0e}.")
+        _capture(frames, norm, aabb, unit, seed, folder, settings, provenance, send)
+
+
+def _capture(
+    frames: list,
+    norm: Normalisation,
+    aabb,
+    unit: float,
+    seed: int,
+    folder: Path,
+    settings: RenderSettings,
+    provenance: dict,
+    send: Callable[[dict], None],
+) -> None:
+    """Renders these frames of the open scene, which is `unit` times as large as the asset."""
+    from .capture import Subject, capture
+    from .displace import displacements
+    from .render_setup import CaptureSettings
+
     shift = None
     if settings.displace:
         norm, aabb, shift = displacements(norm, aabb, len(frames), seed)
@@ -100,7 +132,7 @@ def _render_clip(
     capture(
         RIGS[settings.rig](numbers, seed) + targets(numbers, seed, settings.targets),
         folder,
-        Subject(frames, norm, aabb, shift=shift),
+        Subject(frames, norm, aabb, shift=shift, unit=unit),
         CaptureSettings(
             size=settings.size,
             samples=settings.samples,
@@ -110,7 +142,8 @@ def _render_clip(
             device=settings.device,
             seed=seed % 2**20,
         ),
-        provenance=provenance | {"clip": clip.name, "scene_frames": frames, "cameras_seed": seed},
+        provenance=provenance,
+        refuse_empty=True,
         progress=progress,
     )
 
@@ -188,10 +221,10 @@ def main(job_file: str, log: str) -> int:
         send({"error": str(e)})
         return 2
     except MemoryError:
-        send({"error": f"{job['asset']}: the memory does not suffice; render it smaller or alone."})
+        send({"error": f"{job['asset']['path']}: the memory does not suffice; render it smaller or alone."})
         return 1
     except Exception as e:
-        send({"error": f"{job['asset']}: rendering failed ({type(e).__name__}: {e}); please report it."})
+        send({"error": f"{job['asset']['path']}: rendering failed ({type(e).__name__}: {e}); please report it."})
         return 1
     return 0
 

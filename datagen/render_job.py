@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from collections import Counter
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from . import ASSET_SUFFIXES
 from .rigs import RIGS
@@ -54,27 +55,59 @@ class RenderSettings:
         return _TRACKS[self.tracks] if self.tracks in _TRACKS else int(self.tracks)
 
 
-def expand_folders(assets: list[str]) -> list[str]:
-    """Folders -> the assets in them, sorted; files and "zoo:SEED" stay. InputError for an empty folder."""
-    found = []
-    for asset in map(str, assets):
+@dataclass(frozen=True)
+class Asset:
+    """One thing to render."""
+
+    path: str  # of a file, or "zoo:SEED"
+    name: str  # of its folder below the run's, with "/" between parts; its cameras are drawn from it
+    root: str | None = None  # folder below which paths in the file may lead; None = the file's own
+
+    @property
+    def below_root(self) -> str:
+        """The path from the root on, which is the same on every machine; what can be seen of a file depends on it."""
+        return _relative(self.path, self.root) if self.root else Path(self.path).name
+
+
+def list_assets(given: list[str], root: Path | None = None) -> list[Asset]:
+    """The assets of folders, sorted, of files, and "zoo:SEED". Names are the paths below `root`, or else below the
+    folder that was given (a file given alone: its name), without endings; with them where two would be one, or one the
+    other's folder. InputError for an empty folder, and for a file outside of `root`."""
+    found: dict[str, str | None] = {}  # path -> root
+    for asset in map(str, given):
         path = Path(asset)
         if path.is_dir():
-            files = [Path(root, name) for root, _, names in os.walk(path) for name in names]
+            files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
             inside = sorted(str(f) for f in files if f.suffix.lower() in ASSET_SUFFIXES)
             if not inside:
                 raise InputError(f"{path}: there is no asset in this folder; {', '.join(ASSET_SUFFIXES)} are read.")
-            found += inside
+            for file in inside:
+                found.setdefault(file, str(root or path))
         else:
-            found.append(asset)
-    return list(dict.fromkeys(found))
+            found.setdefault(asset, str(root) if root and not zoo_seed(asset) else None)
+    plain = {path: asset_name(path, root) for path, root in found.items()}
+    keys = [name.lower() for name in plain.values()]  # one folder for both on Windows and macOS
+    folders = {parent.as_posix() for key in set(keys) for parent in PurePosixPath(key).parents}
+    taken = {key for key, count in Counter(keys).items() if count > 1 or key in folders}
+    return [
+        Asset(path, name + Path(path).suffix.lower().replace(".", "-") if name.lower() in taken else name, found[path])
+        for path, name in plain.items()
+    ]
 
 
-def asset_name(asset: str) -> str:
-    """What an asset is called in folders and seeds: a file's name without its ending, "zoo-000007" for "zoo:7"."""
+def asset_name(asset: str, root: str | None = None) -> str:
+    """What an asset is called in folders and seeds: the path of a file below `root`, or its name, without its ending;
+    "zoo-000007" for "zoo:7". InputError for a file that is not below it."""
     if seed := zoo_seed(asset):
         return f"zoo-{int(seed):06d}"
-    return Path(asset).stem
+    return PurePosixPath(_relative(asset, root) if root else Path(asset).name).with_suffix("").as_posix()
+
+
+def _relative(path: str, root: str) -> str:
+    relative = Path(os.path.relpath(path, root))
+    if relative.is_absolute() or relative.parts[0] == "..":
+        raise InputError(f"{path}: it lies outside of --root {root}; give a folder that holds it.")
+    return relative.as_posix()
 
 
 def zoo_seed(asset: str) -> str | None:
@@ -83,20 +116,21 @@ def zoo_seed(asset: str) -> str | None:
     return match[1] if match else None
 
 
-def rendered_clips(folder: Path, asset: str, settings: RenderSettings) -> int:
+def rendered_clips(folder: Path, asset: Asset, settings: RenderSettings) -> int:
     """How many clips the run had that made the Sequence in `folder`, if it is whole and shows this very asset with
     these settings; else 0."""
     try:
         provenance = read_sequence(folder).provenance
-        same = provenance["settings"] == asdict(settings) and provenance["asset"] == Path(asset).name
-        if same and not zoo_seed(asset):
-            same = provenance["sha256"] == hashlib.sha256(Path(asset).read_bytes()).hexdigest()
+        same = provenance["settings"] == asdict(settings) and provenance["asset"] == Path(asset.path).name
+        if same and not zoo_seed(asset.path):
+            same = provenance["path"] == asset.below_root
+            same &= provenance["sha256"] == hashlib.sha256(Path(asset.path).read_bytes()).hexdigest()
         return provenance["clips"] if same else 0
     except (InputError, KeyError, OSError):
         return 0
 
 
-def finished_sequences(folder: Path, asset: str, settings: RenderSettings) -> list[Path]:
+def finished_sequences(folder: Path, asset: Asset, settings: RenderSettings) -> list[Path]:
     """The Sequences of this asset with these settings below `folder`, if all its clips are there and whole; else
     none."""
     folders = [file.parent for file in sorted(folder.glob("*/transforms.json"))]

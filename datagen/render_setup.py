@@ -12,6 +12,7 @@ from pathlib import Path
 import bpy
 from mathutils import Matrix, Vector
 
+from .blender_output import FAINTEST, SEEN
 from .rigs import Shot
 from .sequence import Normalisation
 
@@ -94,7 +95,20 @@ def _set_passes(layer, passes: bool) -> None:
         setattr(layer, name, False)
     layer.use_pass_combined = True
     layer.use_pass_z = layer.use_pass_vector = passes
-    layer.use, layer.samples = True, 0
+    layer.use, layer.samples, layer.pass_alpha_threshold = True, 0, SEEN
+
+
+@contextlib.contextmanager
+def faint_surfaces_have_depth(stage) -> Iterator[None]:
+    """Inside, renders of the stage are one sample, whose depth and motion are those of the first surface that is not
+    all but invisible."""
+    layer = stage.view_layers[0]
+    before = layer.samples, layer.pass_alpha_threshold
+    layer.samples, layer.pass_alpha_threshold = 1, FAINTEST
+    try:
+        yield
+    finally:
+        layer.samples, layer.pass_alpha_threshold = before
 
 
 def _set_output(render) -> None:

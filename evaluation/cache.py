@@ -47,7 +47,8 @@ class Cache:
 
             folder = self.folder / "renders" / settings.rig
             made, failures = render_assets(others, folder, settings, jobs=jobs, report=bar.write, progress=progress)
-        return found | {f.parent.name: open_sequence(f) for f in sorted(made)}, failures
+        names = {f: "-".join(f.parent.relative_to(folder).parts) for f in sorted(made)}
+        return found | {name: open_sequence(f) for f, name in names.items()}, failures
 
     # ---------------------------------------------------------------- rows
 

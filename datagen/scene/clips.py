@@ -9,13 +9,23 @@ assigned: un-muting a track after an evaluation with all muted gives frozen fram
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import bpy
 
 _MOVING_MODIFIERS = {  # those that can move something without any action
     *("MESH_SEQUENCE_CACHE", "NODES", "CLOTH", "SOFT_BODY", "FLUID", "OCEAN", "WAVE", "BUILD", "PARTICLE_SYSTEM"),
+}
+
+
+# Paths that say nothing of the object that they were made for.
+_OF_EVERY_OBJECT = {
+    *("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale"),
+    *("hide_render", "hide_viewport", "color", "rotation_mode"),
 }
 
 
@@ -35,49 +45,56 @@ class Clip:
         return [min(self.frame_start + i, self.frame_end) for i in range(count)]
 
 
-def find_clips(imported: bool) -> list[Clip]:
+def find_clips(imported: bool, gone: Collection = ()) -> list[Clip]:
     """All clips of the open file. `imported`: an importer made the scene, so each group of actions is a clip;
-    else the scene as it is comes first, then the actions that it does not use. Never empty: what does not
-    move is one clip of one frame, named "static"."""
-    clips = [] if imported else _scene_clip()
-    if imported:
-        clips += _track_clips()
+    else the scene as it is comes first, then the actions that it does not use. `gone`: objects about to be removed;
+    what animates them is no clip, and is put on nothing else. Never empty: what does not move is one clip of one frame,
+    named "static"."""
+    clips = _track_clips(gone) if imported else _scene_clip(gone)
     in_use = {id_.animation_data.action for id_ in _animated_ids() if id_.animation_data.action}
     in_tracks = {s.action for id_ in _animated_ids() for t in id_.animation_data.nla_tracks for s in t.strips}
     unused = [a for a in bpy.data.actions if a not in in_tracks and (imported or a not in in_use)]
-    clips += _action_clips(unused)
+    clips += _action_clips(unused, gone)
     frame = bpy.context.scene.frame_current
     return clips or [Clip("static", frame, frame)]
 
 
-def _animated_ids() -> list:
-    """Every data-block of the file that carries animation data (objects, shape keys, materials, …)."""
+def _animated_ids(gone: Collection = ()) -> list:
+    """Every data-block of the file that carries animation data (objects but those `gone`, shape keys, materials, …)."""
     found = []
     for name in ("objects", "shape_keys", "meshes", "armatures", "materials", "curves", "lattices", "metaballs"):
         found += [x for x in getattr(bpy.data, name, ()) if x.animation_data]
     trees = [x.node_tree for x in bpy.data.materials if x.node_tree]
-    return found + [x for x in (*trees, *bpy.data.node_groups) if x.animation_data]
+    found += [x for x in (*trees, *bpy.data.node_groups) if x.animation_data]
+    return [x for x in found if x not in gone]
 
 
-def _scene_clip() -> list[Clip]:
+def _scene_clip(gone: Collection) -> list[Clip]:
     """The scene as it is, where anything in it can move; else none."""
     scene = bpy.context.scene
     moves = any(
         d.animation_data.action or d.animation_data.drivers or any(not t.mute for t in d.animation_data.nla_tracks)
-        for d in _animated_ids()
+        for d in _animated_ids(gone)
     ) or any(
         ob.rigid_body
         or any(m.type in _MOVING_MODIFIERS for m in ob.modifiers)
         or any(c.type == "TRANSFORM_CACHE" for c in ob.constraints)
         for ob in scene.objects
+        if ob not in gone
     )
     return [Clip("scene", scene.frame_start, scene.frame_end)] if moves else []
 
 
-def _track_clips() -> list[Clip]:
+def changes_looks(clip: Clip) -> bool:
+    """Whether the clip animates what a surface looks like, for which nothing has to move."""
+    playing = [owner for owner, *_ in clip.actions] or _animated_ids()
+    return any(isinstance(owner, bpy.types.Material | bpy.types.NodeTree) for owner in playing)
+
+
+def _track_clips(gone: Collection) -> list[Clip]:
     """NLA tracks of one name, whatever they move, are one clip."""
     groups: dict[str, list] = {}
-    for owner in _animated_ids():
+    for owner in _animated_ids(gone):
         for track in owner.animation_data.nla_tracks:
             for strip in track.strips:
                 if strip.action:
@@ -86,13 +103,15 @@ def _track_clips() -> list[Clip]:
     return [_clip(name, actions) for name, actions in groups.items()]
 
 
-def _action_clips(actions: list) -> list[Clip]:
-    """Actions outside of any NLA track, put on what they fit; `Object|Take` names of different objects that
+def _action_clips(actions: list, gone: Collection) -> list[Clip]:
+    """Actions outside of any NLA track, put on what they belong to; `Object|Take` names of different objects that
     share the take are one clip, as are the slots of one action."""
     groups: dict[str, list] = {}
     for action in actions:
         name = action.name.partition("|")[2] or action.name
-        fits = _owners(action)
+        if _is_named_after(action, gone):
+            continue
+        fits = [(owner, *rest) for owner, *rest in _owners(action) if owner not in gone]
         taken = {owner for owner, _, _ in groups.get(name, [])}
         if taken & {owner for owner, _, _ in fits}:
             name = action.name
@@ -101,10 +120,18 @@ def _action_clips(actions: list) -> list[Clip]:
     return [_clip(name, fits) for name, fits in groups.items()]
 
 
+def _is_named_after(action, gone: Collection) -> bool:
+    """Whether Blender named the action by one of these objects: its FBX exporter writes each action once for every
+    object, a camera's path for what stands before it as well."""
+    names = [f"{ob.name}Action" for ob in gone]
+    return any(re.sub(r"\.\d+$", "", part) in names for part in action.name.split("|"))
+
+
 def _owners(action) -> list:
-    """(ID, action, slot) for each slot of the action, on the ID that it names or else fits best."""
-    if not hasattr(action, "slots"):  # before Blender 4.4 an action had one user
-        owner = _best_owner(action.id_root, "", action.fcurves)
+    """(ID, action, slot) for each slot of the action, on the ID that plays it, that it names, or else fits best."""
+    if not hasattr(action, "slots"):  # before Blender 4.4 an action had one user, and named it at most by its own name
+        name = action.name.partition("|")[0].removesuffix("Action")
+        owner = _owner(action, None, action.id_root, name, action.fcurves)
         return [(owner, action, None)] if owner else []
     found = []
     for slot in action.slots:
@@ -116,31 +143,55 @@ def _owners(action) -> list:
             if bag
             for c in bag.fcurves
         ]
-        owner = _best_owner(slot.target_id_type, slot.name_display, curves)
+        owner = _owner(action, slot, slot.target_id_type, slot.name_display, curves)
         if owner:
             found.append((owner, action, slot))
     return found
 
 
-def _best_owner(kind: str, name: str, curves):
-    """The ID of this kind that the most curves fit, of equals the one of this name; None where none fits."""
+def _owner(action, slot, kind: str, name: str, curves):
+    """The ID of this kind whose animation the curves are: the one that plays them, or that their slot names (also by
+    the name that it had when it last played them); else the one that most of them fit, if what they move is not what
+    every object has. None where none is found: what was a deleted camera's path moves nothing else."""
     pools = {"OBJECT": bpy.data.objects, "KEY": bpy.data.shape_keys, "MATERIAL": bpy.data.materials}
     pools["ARMATURE"], pools["MESH"] = bpy.data.armatures, bpy.data.meshes
+    pool = [id_ for id_ in pools.get(kind, ()) if _resolved(id_, curves)]
+    if not pool:
+        return None
+    playing = [id_ for id_ in pool if _plays(id_, action, slot)]
+    named = [id_ for id_ in pool if id_.name == name or _last_played(id_, slot)]
+    if kind == "OBJECT" and not playing and not named and all(_fits_any_object(c) for c in curves):
+        return pool[0] if len(bpy.data.objects) == 1 else None
+    most = max(_resolved(id_, curves) for id_ in pool)
+    fitting = [id_ for id_ in pool if _resolved(id_, curves) == most]
+    for preferred in (playing, named, [id_ for id_ in fitting if id_.animation_data]):
+        if best := [id_ for id_ in preferred if id_ in fitting]:
+            return best[0]
+    return fitting[0]
 
-    def fit(id_) -> float:
-        resolved = 0
-        for c in curves:
-            try:
-                id_.path_resolve(c.data_path)
-                resolved += 1
-            except ValueError:
-                pass
-        # every object has a location: of those that resolve all curves the one of that name wins, then
-        # one that is animated anyhow
-        return resolved + 0.5 * (id_.name == name) + 0.25 * bool(id_.animation_data)
 
-    best = max(pools.get(kind, ()), key=fit, default=None)
-    return best if best is not None and curves and fit(best) >= 1 else None
+def _resolved(id_, curves) -> int:
+    """How many of the curves animate something that the ID has."""
+    found = 0
+    for curve in curves:
+        with contextlib.suppress(ValueError):
+            id_.path_resolve(curve.data_path)
+            found += 1
+    return found
+
+
+def _fits_any_object(curve) -> bool:
+    return curve.data_path.removeprefix("delta_") in _OF_EVERY_OBJECT
+
+
+def _plays(id_, action, slot) -> bool:
+    data = id_.animation_data
+    return bool(data) and data.action == action and (slot is None or data.action_slot == slot)
+
+
+def _last_played(id_, slot) -> bool:
+    data = id_.animation_data
+    return bool(data) and slot is not None and data.last_slot_identifier == slot.identifier
 
 
 def _clip(name: str, actions: list) -> Clip:

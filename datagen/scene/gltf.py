@@ -13,28 +13,25 @@ import numpy as np
 
 from ..sequence import InputError
 
-LARGEST_COORDINATE = 1e6  # what lies beyond is damage, not size: single precision gives out
+LARGEST_COORDINATE = 1e12  # what lies beyond is damage, not size
 _FLOAT32 = 5126  # glTF's number for this component type
 
 
-def check_gltf(path: Path) -> None:
+def check_gltf(path: Path, root: Path) -> None:
     """Raises InputError for a .glb or .gltf that is cut or no glTF, whose positions are not finite or beyond
-    LARGEST_COORDINATE, that lacks a data file, or that refers to a file outside of its folder."""
+    LARGEST_COORDINATE, or that lacks a data file below the folder `root`."""
     try:
         document, binary = _read_document(path)
-        referenced = [(kind, x.get("uri")) for kind in ("buffers", "images") for x in document.get(kind, [])]
+        buffers = [x.get("uri") for x in document.get("buffers", [])]
     except (ValueError, struct.error, AttributeError, TypeError) as e:
         raise InputError(f"{path}: it is damaged ({e}); export it again.") from None
-    for kind, uri in referenced:
-        if not uri or uri.startswith("data:"):
-            continue
-        file = inside_folder(path, unquote(uri))
-        if kind == "buffers" and not file.is_file():
-            raise InputError(f"{path}: its data file {uri} is missing; put it beside it.")
+    for uri in buffers:
+        if uri and not uri.startswith("data:"):
+            _data_file(path, root, uri)
     try:
         # Blender's importer turns what is not finite into zeros
         in_bounds = all(
-            np.abs(points).max(initial=0) <= LARGEST_COORDINATE for points in _positions(path, document, binary)
+            np.abs(points).max(initial=0) <= LARGEST_COORDINATE for points in _positions(path, root, document, binary)
         )
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError) as e:
         raise InputError(f"{path}: its accessors are damaged ({e}); export it again.") from None
@@ -42,14 +39,13 @@ def check_gltf(path: Path) -> None:
         raise InputError(f"{path}: it has vertices that are not finite or beyond {LARGEST_COORDINATE:.0e}; repair it.")
 
 
-def inside_folder(path: Path, reference: str) -> Path:
-    """Where a file named by the asset `path` lies; InputError if that is not below the asset's folder."""
-    folder = path.resolve().parent
-    file = (folder / reference).resolve()
-    if not file.is_relative_to(folder):
-        raise InputError(
-            f"{path}: it refers to {reference}, outside of its own folder; pack it into the file or copy it beside it."
-        )
+def _data_file(path: Path, root: Path, uri: str) -> Path:
+    """Where the data of the asset `path` lie that it names; InputError if they are missing or outside of `root`."""
+    file = (path.resolve().parent / unquote(uri)).resolve()
+    if not file.is_relative_to(root):
+        raise InputError(f"{path}: its data file {uri} lies outside of {root}; give a --root that holds both.")
+    if not file.is_file():
+        raise InputError(f"{path}: its data file {uri} is missing; put it beside it.")
     return file
 
 
@@ -69,7 +65,7 @@ def _read_document(path: Path) -> tuple[dict, bytes]:
     return document, binary
 
 
-def _positions(path: Path, document: dict, binary: bytes):
+def _positions(path: Path, root: Path, document: dict, binary: bytes):
     """(N,3) float32 of each mesh primitive whose positions are stored plainly."""
     primitives = [p for mesh in document.get("meshes", []) for p in mesh["primitives"]]
     for index in {p["attributes"]["POSITION"] for p in primitives if "POSITION" in p["attributes"]}:
@@ -80,6 +76,6 @@ def _positions(path: Path, document: dict, binary: bytes):
         uri = document["buffers"][view["buffer"]].get("uri")
         if "extensions" in view or (uri and uri.startswith("data:")):
             continue
-        data = inside_folder(path, unquote(uri)).read_bytes() if uri else binary
+        data = _data_file(path, root, uri).read_bytes() if uri else binary
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         yield np.ndarray((accessor["count"], 3), "<f4", data, start, (view.get("byteStride", 12), 4))

@@ -17,6 +17,7 @@ from .borrow import borrowed
 from .gltf import LARGEST_COORDINATE
 
 T = TypeVar("T")
+_STILL = 1e-6  # of the largest coordinate: what single precision rounds
 
 
 def check_vertices(path: Path | str, name: str, points: np.ndarray) -> None:
@@ -39,10 +40,21 @@ def _coordinates(items, attribute: str) -> np.ndarray:
     return flat.reshape(-1, 3).astype(np.float64)
 
 
+def _face_vertices(mesh) -> np.ndarray:
+    """(N,3) float64 local coordinates of the vertices that faces have: loose ones and edges show in no render."""
+    if not len(mesh.polygons):
+        return np.empty((0, 3))
+    corners, used = mesh.attributes[".corner_vert"].data, np.zeros(len(mesh.vertices), bool)
+    indices = np.empty(len(corners), np.int32)
+    corners.foreach_get("value", indices)
+    used[indices] = True
+    return mesh_vertices(mesh)[used]
+
+
 def _local_points(ob) -> np.ndarray:
     """(N,3) local coordinates of what an evaluated object shows; none for a kind that shows nothing."""
     if ob.type == "MESH":
-        return mesh_vertices(ob.data)
+        return _face_vertices(ob.data)
     if ob.type in ("CURVES", "POINTCLOUD") and (position := ob.data.attributes.get("position")):
         return _coordinates(position.data, "vector")
     return np.array(ob.bound_box if ob.type == "VOLUME" else [], float).reshape(-1, 3)
@@ -153,10 +165,12 @@ def normalisation(
             check_vertices(name, part, points)
             low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
     if not np.isfinite(low).all():
-        where = f"frames {frames[0]} to {frames[-1]}"
+        where = f"frames {frames[0]:g} to {frames[-1]:g}"
+        if any(len(mesh.vertices) and not len(mesh.polygons) for mesh in bpy.data.meshes):
+            raise InputError(f"{name}: what is visible in {where} has points and edges alone; give it faces.")
         raise InputError(f"{name}: no mesh is visible to renders in {where}; show it there, or choose others.")
     centre, scale = (low + high) / 2, float((high - low).max() / 2)
-    if not scale > 1e-9:
+    if not scale > max(1e-20, _STILL * np.abs(centre).max()):
         raise InputError(f"{name}: all vertices lie at one point; give an object that has a size.")
     norm = Normalisation(scale, tuple(float(x) for x in centre))
     return norm, np.stack([low - centre, high - centre]) / scale
@@ -177,3 +191,19 @@ def motion(frames: list[int], objects: list | None = None) -> float:
     high = np.max([p.max(0) for t in whole for p in t], 0)
     moved = np.concatenate([np.max([np.linalg.norm(p - t[0], axis=1) for p in t], 0) for t in whole])
     return float(moved.mean() / max((high - low).max() / 2, 1e-9))
+
+
+def holds_still(frames: Sequence[float]) -> bool:
+    """Whether no vertex of the open scene moves in these frames, nor appears or vanishes; looks no further than where
+    one does."""
+    first: list | None = None
+    for found in as_rendered(frames, world_vertices):
+        if first is None:
+            first = found
+        elif len(found) != len(first):
+            return False
+        else:
+            for (_, points), (_, before) in zip(found, first, strict=True):
+                if points.shape != before.shape or np.abs(points - before).max() > _STILL * np.abs(before).max():
+                    return False
+    return True

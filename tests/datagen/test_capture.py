@@ -278,3 +278,59 @@ def test_cameras_whose_names_differ_in_signs_alone_get_files_of_their_own(plane,
     seq = capture(shots, tmp_path / "s", Subject([1, 2], NORM), CaptureSettings(size=8, samples=1))
     assert [v.image for v in seq.views] == ["images/r_a-b-2_0000.png", "images/r_a-b_0001.png"]
     assert [v.passes for v in seq.views] == ["passes/r_a-b-2_0000.exr", "passes/r_a-b_0001.exr"]
+
+
+def glass(alpha, colour=(0.2, 0.5, 0.9, 1)):
+    material = bpy.data.materials.new("glass")
+    shader = material.node_tree.nodes["Principled BSDF"]
+    shader.inputs["Base Color"].default_value, shader.inputs["Alpha"].default_value = colour, alpha
+    return material
+
+
+@pytest.mark.parametrize("alpha", [0.1, 0.4, 0.9])
+def test_faint_surfaces_have_depth_and_motion(plane, tmp_path, alpha):
+    """Nothing behind them: theirs is the depth, whatever their alpha."""
+    plane.data.materials[0] = glass(alpha)
+    shots = [Shot(0, "a", "r", rigs.spherical(20, 10, 2.4))]
+    seq = capture(shots, tmp_path / "s", Subject([4], NORM), CaptureSettings(size=32, samples=4, tracks=None))
+    p, v = seq.load_passes(0), seq.views[0]
+    z, flow_next, hit = expected(v, 4, 32, 32, 1)
+    body = inside(hit)
+    assert body.sum() > 100 and np.abs(seq.load_image(0)[body][:, 3] / 255 - alpha).max() < 0.2
+    assert (np.abs(p.depth - z)[body] <= 1.5 * np.abs(np.gradient(z)).sum(0)[body] + 1e-4).all()
+    assert np.abs(p.flow_next - flow_next)[body].max() < 0.05
+
+
+def test_behind_a_faint_surface_is_what_it_shows(plane, tmp_path):
+    """And a surface that is not there at all, as between leaves, has no depth."""
+    plane.data.materials[0] = glass(0.1)
+    bpy.ops.mesh.primitive_plane_add(size=20, rotation=(np.pi / 2, 0, 0), location=(0, 3, 0))
+    wall = bpy.context.object
+    shots = [Shot(0, "a", "r", rigs.spherical(0, 0, 2.4))]
+    settings = CaptureSettings(size=24, samples=4, tracks=None)
+    depth = capture(shots, tmp_path / "s", Subject([0], NORM), settings).load_passes(0).depth
+    assert np.mean(np.isclose(depth, 2.4 + (3 - 0.1) / 1.6, atol=1e-3)) > 0.9  # Cycles draws lots for the others
+    plane.data.materials[0] = glass(0.3)
+    depth = capture(shots, tmp_path / "f", Subject([0], NORM), settings).load_passes(0).depth
+    assert np.allclose(depth[8:16, 8:16], 2.4 - 0.1 / 1.6, atol=1e-3)  # the plane's own
+    wall.hide_render = True
+    plane.data.materials[0] = glass(0.01)
+    depth = capture(shots, tmp_path / "t", Subject([0], NORM), settings).load_passes(0).depth
+    assert np.isfinite(depth).mean() < 0.1
+
+
+def test_pictures_that_show_nothing_can_be_a_failure(plane, tmp_path):
+    plane.data.materials[0] = glass(0.0)
+    shots, settings = rigs.canonical([0]), CaptureSettings(size=16, samples=1, tracks=None)
+    with pytest.raises(InputError, match=r"s: no picture shows anything.*;.*\.$"):
+        capture(shots, tmp_path / "s", Subject([0], NORM), settings, refuse_empty=True)
+    assert not list(tmp_path.iterdir())
+    assert not capture(shots, tmp_path / "s", Subject([0], NORM), settings).load_image(0).any()
+
+
+def test_a_scene_that_was_enlarged_leads_back_to_the_asset(plane, tmp_path):
+    shots, settings = rigs.canonical([0])[:1], CaptureSettings(size=16, samples=1)
+    a = capture(shots, tmp_path / "a", Subject([0], NORM), settings)
+    b = capture(shots, tmp_path / "b", Subject([0], NORM, unit=4.0), settings)
+    assert np.array_equal(a.load_image(0), b.load_image(0)) and a.normalisation == NORM
+    assert b.normalisation.scale == 0.4 and np.allclose(b.normalisation.translation, np.array(NORM.translation) / 4)

@@ -2,6 +2,7 @@
 import argparse
 import json
 import os
+import shutil
 import sys
 from dataclasses import replace
 
@@ -136,6 +137,63 @@ def test_a_child_that_dies_is_one_sentence(assets, tmp_path, monkeypatch):
     assert "signal 11" in failures[0] and "last words" in failures[0] and "still.glb" in failures[0]
     with pytest.raises(InputError, match="signal 11"):
         render_shots(str(assets / "still.glb"), tmp_path / "x", "random", SMALL)
+
+
+# ---------------------------------------------------------------- what is not as it should be
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    """A folder with two assets of one name, one of which is tiny and the other huge, both flying; and a .blend whose
+    motion is a script."""
+    folder = tmp_path_factory.mktemp("odd")
+    for name, size in (("ant", 1e-7), ("moon", 1e8)):
+        empty_session()
+        bpy.ops.mesh.primitive_cube_add(size=2 * size)
+        for frame in (0, 10):
+            bpy.context.object.location = (frame / 10 * size, 0, 0)
+            bpy.context.object.keyframe_insert("location", frame=frame)
+        (folder / name).mkdir()
+        bpy.ops.export_scene.gltf(filepath=str(folder / name / "scene.gltf"), export_format="GLTF_SEPARATE")
+    empty_session()
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.context.object.driver_add("location", 2).driver.expression = "__import__('math').sin(frame)"
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "script.blend"))
+    return folder
+
+
+def test_the_tiny_the_huge_and_what_is_said_of_a_script(odd, tmp_path):
+    said = []
+    settings = replace(SMALL, frames=3, tracks="none")
+    folders, failures = render_assets([str(odd)], tmp_path, settings, report=said.append)
+    assert not failures and len(folders) == 3
+    ant, moon = (next((tmp_path / name / "scene").glob("*")) for name in ("ant", "moon"))
+    sizes = [read_sequence(f).normalisation.scale for f in (ant, moon)]
+    assert sizes[1] / sizes[0] == pytest.approx(1e15, rel=0.1) and 1e-7 < sizes[0] < 3e-7
+    for folder in (ant, moon):
+        seq = read_sequence(folder)
+        p, alpha = seq.load_passes(0), seq.load_image(0)[..., 3] / 255
+        assert alpha.mean() > 0.2 and np.nanmin(p.depth) == pytest.approx(1.9, abs=0.4)
+        assert np.abs(p.flow_next[alpha == 1][:, 0]).max() > 0.3
+    a, b = (read_sequence(f).load_image(0).astype(float) for f in (ant, moon))
+    assert np.abs(a - b).mean() < 20  # but for noise, whose seed is of the name
+    told = read_sequence(tmp_path / "script" / "scene").provenance["warnings"]
+    assert (
+        told == said
+        and ["scripted drivers of Cube" in said[0], "nothing moves in frames 1 to 3" in said[1]] == [True] * 2
+    )
+
+
+def test_a_root_that_was_forgotten_is_rendered_again(odd, tmp_path):
+    asset, settings = str(odd / "ant" / "scene.gltf"), replace(SMALL, frames=1, passes=False, tracks="none")
+    (folder,), _ = render_assets([asset], tmp_path, settings)
+    assert folder.parent == tmp_path / "scene" and read_sequence(folder).provenance["path"] == "scene.gltf"
+    (below,), _ = render_assets([asset], tmp_path, settings, root=odd)
+    assert below.parent == tmp_path / "ant" / "scene"
+    shutil.copytree(below.parent, tmp_path / "scene", dirs_exist_ok=True)
+    before = (folder / "transforms.json").stat().st_mtime_ns
+    render_assets([asset], tmp_path, settings)
+    assert (folder / "transforms.json").stat().st_mtime_ns != before
 
 
 def arguments(*words):

@@ -3,7 +3,14 @@ import os
 
 import pytest
 
-from timesplat.datagen.render_job import RenderSettings, asset_name, expand_folders, finished_sequences, zoo_seed
+from timesplat.datagen.render_job import (
+    Asset,
+    RenderSettings,
+    asset_name,
+    finished_sequences,
+    list_assets,
+    zoo_seed,
+)
 from timesplat.datagen.sequence import InputError
 
 
@@ -42,11 +49,44 @@ def test_folders_may_go_while_assets_are_looked_for(tmp_path, monkeypatch):
         return look(path)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    assert expand_folders([str(tmp_path)]) == [str(tmp_path / "a.glb"), str(tmp_path / "b" / "c.FBX")]
+    root = str(tmp_path)
+    assert list_assets([root]) == [
+        Asset(str(tmp_path / "a.glb"), "a", root),
+        Asset(str(tmp_path / "b" / "c.FBX"), "b/c", root),
+    ]
+
+
+def named(tmp_path, *files, given=None, root=None):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    listed = list_assets([str(tmp_path / name) for name in given or [""]], root)
+    return {asset.below_root: asset.name for asset in listed}
+
+
+def test_names_are_paths_below_the_folder_given(tmp_path):
+    files = ("chair/scene.gltf", "lamp/scene.gltf", "x.y.glb", "Fox.fbx", "fox.glb", "chair.obj")
+    assert named(tmp_path, *files) == {
+        "chair/scene.gltf": "chair/scene",
+        "lamp/scene.gltf": "lamp/scene",
+        "x.y.glb": "x.y",
+        "Fox.fbx": "Fox-fbx",  # one folder for both where capitals count for nothing
+        "fox.glb": "fox-glb",
+        "chair.obj": "chair-obj",  # its clips would lie beside those of chair/scene
+    }
+
+
+def test_files_given_alone(tmp_path):
+    files = ("a/scene.gltf", "b/scene.gltf")
+    assert named(tmp_path, *files, given=files[:1]) == {"scene.gltf": "scene"}
+    assert named(tmp_path, *files, given=files, root=tmp_path) == {"a/scene.gltf": "a/scene", "b/scene.gltf": "b/scene"}
+    with pytest.raises(InputError, match=r"outside of --root [^\n]*;[^\n]*\.$"):
+        named(tmp_path, *files, given=files, root=tmp_path / "a")
 
 
 def test_nothing_is_finished_where_nothing_is(tmp_path):
-    assert finished_sequences(tmp_path / "no", "a.glb", RenderSettings()) == []
+    asset = Asset("a.glb", "a")
+    assert finished_sequences(tmp_path / "no", asset, RenderSettings()) == []
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "transforms.json").write_text("{")
-    assert finished_sequences(tmp_path, "a.glb", RenderSettings()) == []
+    assert finished_sequences(tmp_path, asset, RenderSettings()) == []

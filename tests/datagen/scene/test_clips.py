@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from timesplat.datagen.render_asset import most_moving_clip
-from timesplat.datagen.scene.clips import Clip
+from timesplat.datagen.scene.clips import Clip, changes_looks
 from timesplat.datagen.scene.measure import motion, normalisation
 from timesplat.datagen.scene.open import empty_session, open_asset
 
@@ -152,3 +152,93 @@ def test_every_kind_of_animation_of_a_gltf(tmp_path, build, clips, most):
     assert clip.name == most and motion(clip.frames(24)) > 0.01
     norm, box = normalisation(clip.frames(24))
     assert np.abs(box).max() == pytest.approx(1) and norm.scale > 0
+
+
+# ---------------------------------------------------------------- what animates lights and cameras
+
+
+def fly(ob, frames=(1, 12)):
+    key(ob, "location", {frames[0]: (0, 0, 0), frames[1]: (9, 9, 9)})
+    return ob.animation_data.action
+
+
+def lamp_and_camera():
+    """A light and a camera, each on a path of its own; their actions."""
+    bpy.ops.object.light_add(type="POINT")
+    lamp = fly(bpy.context.object)
+    bpy.ops.object.camera_add()
+    return lamp, fly(bpy.context.object)
+
+
+def save(path, kind):
+    """Writes the scene as a file of that kind."""
+    if kind == "blend":
+        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    elif kind == "fbx":
+        bpy.ops.export_scene.fbx(filepath=str(path))
+    else:
+        bpy.context.scene.frame_set(1)
+        bpy.ops.export_scene.gltf(
+            filepath=str(path), export_animation_mode="ACTIONS", export_lights=True, export_cameras=True
+        )
+    return path
+
+
+@pytest.mark.parametrize("kind", ["blend", "glb", "fbx"])
+@pytest.mark.parametrize("moves", [False, True], ids=["still", "turning"])
+def test_the_path_of_a_camera_moves_nothing_else(tmp_path, kind, moves):
+    empty_session()
+    ob = cube()
+    if moves:
+        key(ob, "rotation_euler", {1: (0, 0, 0), 12: (0, 0, 0.5)})
+    lamp_and_camera()
+    asset = open_asset(save(tmp_path / f"a.{kind}", kind))
+    assert {o.type for o in bpy.data.objects} == {"MESH"}
+    owners = {owner.name for clip in asset.clips for owner, *_ in clip.actions}
+    assert owners <= ({"Cube"} if moves else set())
+    clip = most_moving_clip(asset)
+    asset.play(clip)
+    moved = motion(clip.frames(12))
+    assert 0.1 < moved < 1 if moves else moved == 0
+    assert len(asset.clips) == 1 and (moves or clip.name == "static")
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_an_action_whose_owner_was_deleted_long_ago(tmp_path, named):
+    """A path alone says not whose it is; where the file holds two objects it is nobody's, unless one bears its name."""
+    empty_session()
+    bpy.ops.object.camera_add()
+    bpy.context.object.name = "B" if named else "Camera"
+    action = fly(bpy.context.object)
+    action.use_fake_user = True
+    bpy.data.objects.remove(bpy.context.object)
+    cube("A"), cube("B", (0, 5, 0))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    clips = open_asset(tmp_path / "a.blend").clips
+    owners = [owner.name for clip in clips for owner, *_ in clip.actions]
+    if hasattr(bpy.types.Action, "slots"):
+        assert owners == (["B"] if named else [])
+
+
+def test_an_action_follows_an_object_that_was_renamed(tmp_path):
+    empty_session()
+    ob = cube("A")
+    cube("other")
+    action = fly(ob)
+    action.use_fake_user = True
+    ob.animation_data.action = None
+    ob.name = "Z"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    clips = open_asset(tmp_path / "a.blend").clips
+    if hasattr(bpy.types.Action, "slots"):
+        assert [owner.name for clip in clips for owner, *_ in clip.actions] == ["Z"]
+
+
+def test_clips_that_change_looks():
+    empty_session()
+    cube().data.materials.append(bpy.data.materials.new("m"))
+    assert not changes_looks(Clip("scene", 1, 9))
+    tree = bpy.data.materials["m"].node_tree
+    tree.nodes["Principled BSDF"].inputs["Roughness"].keyframe_insert("default_value", frame=1)
+    assert changes_looks(Clip("scene", 1, 9)) and changes_looks(Clip("x", 1, 9, [(tree, None, None)]))
+    assert not changes_looks(Clip("x", 1, 9, [(bpy.data.objects["Cube"], None, None)]))

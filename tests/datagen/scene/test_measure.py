@@ -3,7 +3,7 @@ import bpy
 import numpy as np
 import pytest
 
-from timesplat.datagen.scene.measure import motion, normalisation, vertices_at
+from timesplat.datagen.scene.measure import holds_still, motion, normalisation, vertices_at
 from timesplat.datagen.scene.open import empty_session, open_asset
 from timesplat.datagen.sequence import InputError, Normalisation
 
@@ -63,3 +63,53 @@ def test_what_only_the_viewport_hides_is_measured_in_both_ways():
     for rendered in (True, False):
         assert normalisation([1], [ob], rendered=rendered)[0] == Normalisation(1.0, (0.0, 0.0, 0.0))
     assert ob.hide_viewport
+
+
+def mesh(name, vertices, edges=(), faces=()):
+    data = bpy.data.meshes.new(name)
+    data.from_pydata(vertices, edges, faces)
+    ob = bpy.data.objects.new(name, data)
+    bpy.context.collection.objects.link(ob)
+    return ob
+
+
+@pytest.mark.parametrize("loose", ["edges", "points", "beside faces"])
+def test_what_no_render_shows_does_not_count(loose):
+    empty_session()
+    far = [(50, 0, 0), (0, 0, 90)]
+    if loose == "beside faces":
+        mesh("both", [(-1, 0, -1), (1, 0, -1), (0, 0, 1), *far], [(3, 4)], [(0, 1, 2)])
+    else:
+        cube()
+        mesh("loose", far, [(0, 1)] if loose == "edges" else [])
+    assert normalisation([1])[0] == Normalisation(1.0, (0.0, 0.0, 0.0))
+    assert motion([1, 2]) == 0
+
+
+@pytest.mark.parametrize("edges", [[(0, 1), (1, 2)], []])
+def test_points_and_wires_alone_are_refused(edges):
+    empty_session()
+    mesh("loose", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], edges)
+    with pytest.raises(InputError, match=r"^x: .* points and edges alone; .*\.$"):
+        normalisation([1], name="x")
+
+
+def test_edges_that_a_modifier_gives_faces_are_measured():
+    empty_session()
+    wire = mesh("wire", [(0, 0, 0), (0, 0, 2)], [(0, 1)])
+    wire.modifiers.new("skin", "SKIN")
+    assert normalisation([1])[0].scale > 0.9
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1e7])
+def test_what_holds_still(size):
+    empty_session()
+    ob = cube(size=2)
+    ob.scale = (size,) * 3
+    assert holds_still([1, 2, 3])
+    key(ob, "location", {1: (0, 0, 0), 3: (0.01 * size, 0, 0)})
+    assert not holds_still([1, 2, 3]) and holds_still([3, 3, 4])
+    ob.animation_data_clear()
+    other = cube("other")
+    key(other, "hide_render", {1: False, 3: True})
+    assert not holds_still([1, 2, 3])
