@@ -9,6 +9,7 @@ gives picture, depth and motion vectors at once.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import tempfile
@@ -57,8 +58,8 @@ from .tracks import track_surfaces
 class Subject:
     """What is captured of the open scene.
 
-    frames          the scene frame of each frame of the clip, evenly apart (the clip's rate is the scene's over that);
-                    may repeat one (a padded clip holds still)
+    frames          the scene frame of each frame of the clip, evenly apart (the clip's rate is the scene's over that),
+                    also between two; may repeat one (a padded clip holds still)
     normalisation   leads from the cameras' normalised space to the world
     aabb            (2,3) the box over all frames, normalised; None = the whole of [-1,1]
     objects         Blender objects that the cameras see; None = all that the scene shows to renders
@@ -66,7 +67,7 @@ class Subject:
     unit            the open scene is so many times as large as what the Sequence's normalisation leads back to
     """
 
-    frames: list[int]
+    frames: list[float]
     normalisation: Normalisation
     aabb: np.ndarray | None = None
     objects: list | None = None
@@ -175,7 +176,8 @@ def _render_frames(
     if subject.shift is not None:
         shots = displace.counter_moved(shots, subject.shift)
     for frame, group in groupby(shots, key=lambda shot: shot.frame):
-        cameras.stage.frame_set(subject.frames[frame])
+        whole = math.floor(subject.frames[frame])
+        cameras.stage.frame_set(whole, subframe=subject.frames[frame] - whole)
         if settings.engine == "CYCLES":
             cameras.stage.cycles.seed = settings.seed + frame
         cameras.place(list(group))
@@ -231,12 +233,12 @@ def _write_tracks(seq: Sequence, folder: Path, subject: Subject, settings: Captu
         write_tracks(folder / seq.tracks, tracks)
 
 
-def _scene_frames_per_frame(frames: list[int]) -> int:
+def _scene_frames_per_frame(frames: list[float]) -> float:
     """Scene frames between two frames of a clip: 1 where there is but one, or they do not go on."""
-    return max(frames[1] - frames[0], 1) if len(frames) > 1 else 1
+    return frames[1] - frames[0] if len(frames) > 1 and frames[1] > frames[0] else 1
 
 
-def _scale_flow_to_steps(passes: Passes, frames: list[int], i: int) -> None:
+def _scale_flow_to_steps(passes: Passes, frames: list[float], i: int) -> None:
     """Motion per scene frame -> motion per frame of the clip; a padded frame holds still."""
     passes.flow_next *= frames[i + 1] - frames[i] if i + 1 < len(frames) else 1
     passes.flow_prev *= frames[i] - frames[i - 1] if i > 0 else 1

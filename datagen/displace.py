@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from .passes import Passes
-from .rigs import Shot
+from .rigs import RADIUS, Shot
 from .sequence import Normalisation, View, opengl_to_opencv
 
 
@@ -25,7 +25,8 @@ def displacements(
 
     Direction uniform on the sphere; the whole way is 0.1 to 0.6 of the longest half-side; steps vary by a
     factor of three. Returns the Normalisation and the box over all frames, moved object included, and the
-    displacements (count,3) in the new normalised units, of mean zero between first and last.
+    displacements (count,3) in the new normalised units, of mean zero between first and last. No vertex goes farther
+    from the origin than RADIUS.
     """
     rng = np.random.default_rng([seed, 4])
     direction = rng.normal(size=3)
@@ -35,6 +36,8 @@ def displacements(
     shift = rng.uniform(0.1, 0.6) * way[:, None] * direction  # old normalised units
     low, high = aabb[0] + shift.min(0), aabb[1] + shift.max(0)
     centre, scale = (low + high) / 2, float((high - low).max() / 2)
+    radius = min(RADIUS, float(np.linalg.norm(aabb, axis=1).max()))  # at most, of the object at rest
+    scale = max(scale, (radius + float(np.linalg.norm(shift - centre, axis=1).max())) / RADIUS)
     moved = Normalisation(
         normalisation.scale * scale,
         tuple(float(x) for x in np.asarray(normalisation.translation) + normalisation.scale * centre),

@@ -23,7 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from . import ASSET_SUFFIXES
-from .render_job import ALL_CLIPS, Asset, RenderSettings, finished_sequences, list_assets
+from .render_job import ALL_CLIPS, CLIPS, Asset, RenderSettings, finished_sequences, list_assets
 from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
 
@@ -223,6 +223,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rig", default=defaults.rig, choices=list(RIGS), help="cameras (default: %(default)s)")
     parser.add_argument("--targets", type=int, default=defaults.targets, metavar="N", help="held-out views a frame")
     parser.add_argument("--clip", default=defaults.clip, help="most-moving (default), first, all, or a clip's name")
+    parser.add_argument("--clips", default=defaults.clips, choices=CLIPS, help="of a long animation the first frames "
+                        "(default), or all of it in consecutive clips")  # fmt: skip
+    parser.add_argument("--start", type=int, default=defaults.start, metavar="N", help="pass over so many frames")
+    parser.add_argument("--every", type=int, default=defaults.every, metavar="N", help="take each Nth frame")
+    parser.add_argument("--spread", action="store_true", help="spread the frames evenly over the whole animation")
     parser.add_argument("--frames", type=int, default=defaults.frames, help="length of a clip (%(default)s)")
     parser.add_argument("--size", type=int, default=defaults.size, help="pixels (%(default)s)")
     parser.add_argument("--samples", type=int, default=defaults.samples, help="samples a pixel (%(default)s)")

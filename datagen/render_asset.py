@@ -9,18 +9,21 @@ What needs Blender is imported late: it starts its threads, and prints, only aft
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import sys
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from .render_job import (
     ALL_CLIPS,
+    CONSECUTIVE,
     FIRST_CLIP,
     MOST_MOVING_CLIP,
+    SINGLE,
     Asset,
     RenderSettings,
     rendered_clips,
@@ -40,12 +43,16 @@ def run_job(job: dict, send: Callable[[dict], None]) -> None:
         send({"warning": warning})
     if settings.device == "GPU":
         use_gpu()
-    clips = choose_clips(opened, settings)
+    clips = cut_clips(choose_clips(opened, settings), settings, asset.path)
     provenance |= {"settings": asdict(settings), "clips": len(clips), "warnings": opened.warnings}
+    simulated = False
     for name, clip in _folder_names(clips).items():
         folder = Path(job["folder"]) if "folder" in job else Path(job["out"]) / name
         if not rendered_clips(folder, asset, settings):  # else it is of a run that was cut off
             opened.play(clip)
+            if not clip.actions and not simulated:
+                simulate_scene([c for c in clips if not c.actions], settings)
+                simulated = True
             _render_clip(clip, asset, folder, settings, provenance, send)
         send({"written": str(folder)})
 
@@ -75,13 +82,10 @@ def _render_clip(
     from .scene.clips import changes_looks
     from .scene.measure import holds_still, normalisation
     from .scene.rescale import LARGEST, SMALLEST, rescaled
-    from .scene.simulate import simulate
 
-    frames = clip.frames(settings.frames)
+    frames = scene_frames(clip, settings)
     if settings.displace:
         frames = frames[:1] * settings.frames
-    if not clip.actions:
-        simulate(frames[-1])
     warnings = list(provenance["warnings"])
     if clip.frame_end > clip.frame_start and not settings.displace and not changes_looks(clip) and holds_still(frames):
         span = f"{frames[0]:g} to {frames[-1]:g}"
@@ -173,7 +177,7 @@ def choose_clips(opened, settings: RenderSettings) -> list:
     if settings.clip == FIRST_CLIP:
         return opened.clips[:1]
     if settings.clip == MOST_MOVING_CLIP:
-        return [most_moving_clip(opened, settings.frames)]
+        return [most_moving_clip(opened, settings)]
     chosen = [c for c in opened.clips if c.name == settings.clip]
     if not chosen:
         names = ", ".join(c.name for c in opened.clips)
@@ -181,19 +185,49 @@ def choose_clips(opened, settings: RenderSettings) -> list:
     return chosen[:1]
 
 
-def most_moving_clip(opened, count: int = 24):
-    """The clip in whose first `count` frames the vertices move most, judged by six of them."""
+def most_moving_clip(opened, settings: RenderSettings | None = None):
+    """The clip in whose frames, those that the settings choose, the vertices move most, judged by six of them."""
     from .scene.measure import motion
 
     if len(opened.clips) == 1:
         return opened.clips[0]
+    settings = settings or RenderSettings()
+    whole = replace(settings, clips=SINGLE, every=1, spread=True) if settings.clips == CONSECUTIVE else settings
 
     def amount(clip) -> float:
         opened.play(clip)
-        frames = clip.frames(count)
-        return motion([frames[round(i * (len(frames) - 1) / 5)] for i in range(6)])
+        frames = scene_frames(clip, whole)
+        return motion([frames[round(i * (len(frames) - 1) / 5)] for i in range(6)]) if frames else -1.0
 
     return max(opened.clips, key=amount)
+
+
+def scene_frames(clip, settings: RenderSettings) -> list[float]:
+    """The scene frames of a clip that the settings choose; none where it ends before `settings.start`."""
+    start = 0 if settings.clips == CONSECUTIVE else settings.start  # `cut_clips` has passed it over
+    return clip.frames(settings.frames, start=start, every=settings.every, spread=settings.spread)
+
+
+def cut_clips(clips: list, settings: RenderSettings, name: str) -> list:
+    """The clips, each cut into consecutive ones where the settings say so. InputError (with `name`) if none of them
+    lasts until `settings.start`."""
+    if settings.clips == CONSECUTIVE:
+        found = [part for c in clips for part in c.cut(settings.frames, start=settings.start, every=settings.every)]
+    else:
+        found = [c for c in clips if scene_frames(c, settings)]
+    if not found:
+        longest = max(c.frame_end - c.frame_start + 1 for c in clips)
+        raise InputError(
+            f"{name}: it has {longest} frames, none from --start {settings.start} on; choose an earlier one."
+        )
+    return found
+
+
+def simulate_scene(clips: list, settings: RenderSettings) -> None:
+    """Plays what is simulated up to the last frame of these clips."""
+    from .scene.simulate import simulate
+
+    simulate(math.ceil(max(scene_frames(clip, settings)[-1] for clip in clips)))
 
 
 def _folder_names(clips: list) -> dict:

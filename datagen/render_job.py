@@ -18,8 +18,9 @@ from .rigs import RIGS
 from .sequence import InputError, read_sequence
 
 FIRST_CLIP, MOST_MOVING_CLIP, ALL_CLIPS = "first", "most-moving", "all"  # what `RenderSettings.clip` may be
+SINGLE, CONSECUTIVE = CLIPS = ("single", "consecutive")  # what `RenderSettings.clips` may be
 _TRACKS = {"auto": 0, "none": None}
-_LEAST = {"frames": 1, "size": 8, "samples": 1, "targets": 0, "seed": 0}
+_LEAST = {"start": 0, "every": 1, "frames": 1, "size": 8, "samples": 1, "targets": 0, "seed": 0}
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,10 @@ class RenderSettings:
     rig: str = "default"  # a name in rigs.RIGS
     targets: int = 0  # held-out random views a frame
     clip: str = MOST_MOVING_CLIP  # "most-moving", "first", "all" or a clip's name
+    clips: str = SINGLE  # of a long animation: "single", its first frames, or "consecutive", all of it in clips
+    start: int = 0  # frames of the animation that are passed over
+    every: int = 1  # scene frames from one frame of the clip to the next
+    spread: bool = False  # the clip's frames evenly over the whole animation, at fractions of scene frames
     frames: int = 24
     size: int = 128  # pixels of the square pictures' sides
     samples: int = 16  # a pixel
@@ -46,6 +51,10 @@ class RenderSettings:
         for name, least in _LEAST.items():
             if getattr(self, name) < least:
                 raise InputError(f"--{name} {getattr(self, name)}: too small; give {least} or more.")
+        if self.clips not in CLIPS:
+            raise InputError(f"--clips {self.clips}: there is no such way; choose one of {', '.join(CLIPS)}.")
+        if self.spread and (self.every > 1 or self.clips == CONSECUTIVE):
+            raise InputError("--spread: it chooses the frames itself; drop --every and --clips consecutive.")
         if self.tracks not in _TRACKS and not re.fullmatch(r"[1-9][0-9]{0,6}", self.tracks):
             raise InputError(f"--tracks {self.tracks}: not a number of points; give one, auto or none.")
 

@@ -17,6 +17,8 @@ import numpy as np
 
 DISTANCE = 2.7  # of most cameras from the origin, in normalised units
 FOV = 50.0  # degrees, full field of view
+RADIUS = 1.1  # of the ball around the origin that holds every object, see `scene.measure.normalisation`
+NEAREST = RADIUS / math.sin(math.radians(FOV) / 2)  # a camera that is nearer does not see this ball whole
 CANONICAL = {"front": 0.0, "left": 90.0, "back": 180.0, "right": 270.0}  # camera id -> azimuth in degrees
 
 
@@ -83,11 +85,11 @@ def elevated(frames: Sequence[int], seed: int = 0) -> list[Shot]:
 
 def orbit(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     """One camera on an orbit of its own: start, sense, half to one and a half turns, a swing of the
-    elevation within [-20,50] degrees and of the distance within [2.3,3.5] are drawn from the seed."""
+    elevation within [-20,50] degrees and of the distance within [NEAREST,3.5] are drawn from the seed."""
     rng = np.random.default_rng([seed, 2])
     start, turn = rng.uniform(0, 360), rng.choice([-1, 1]) * rng.uniform(180, 540)
     middle, swing = rng.uniform(0, 30), rng.uniform(0, 20)
-    far, near = rng.uniform(2.7, 3.5), rng.uniform(2.3, 2.7)
+    far, near = rng.uniform(DISTANCE, 3.5), rng.uniform(NEAREST, DISTANCE)
     phase_e, phase_d = rng.uniform(0, 2 * math.pi, 2)
     shots = []
     for f, p in zip(frames, _phase(frames), strict=True):

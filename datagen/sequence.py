@@ -5,8 +5,9 @@ The layout is the one of NeRF and D-NeRF datasets (`transforms.json`, `images/`,
 other programs read it as it is. What others wrote comes by `readers`. numpy only: neither bpy nor torch is needed here.
 
 Conventions
-    world       right-handed, Z up; positions are normalised: the object's bounds over the whole clip are
-                centred at the origin and their longest half-side is 1. `Normalisation` leads back.
+    world       right-handed, Z up; positions are normalised: the object's box over the whole clip is centred at
+                the origin, its longest half-side is at most 1, and no vertex is farther than 1.1. `Normalisation` leads
+                back.
     cameras     on disk 4x4 camera-to-world, OpenGL axes (x right, y up, looks along -z);
                 `opengl_to_opencv` is the one place where the axes are turned.
     time        on disk 0..1 over the clip (D-NeRF's); for the model `model_time`: -1..1, a single frame 0.

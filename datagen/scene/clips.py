@@ -13,7 +13,7 @@ import contextlib
 import math
 import re
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 
@@ -38,11 +38,30 @@ class Clip:
     frame_end: int
     actions: list = field(default_factory=list)  # (ID that moves, Action, slot or None); [] = the scene as it is
 
-    def frames(self, count: int = 24) -> list[int]:
-        """The first `count` scene frames; a shorter clip repeats its last. A clip of one frame has one."""
-        if self.frame_end <= self.frame_start:
-            return [self.frame_start]
-        return [min(self.frame_start + i, self.frame_end) for i in range(count)]
+    def frames(self, count: int = 24, *, start: int = 0, every: int = 1, spread: bool = False) -> list[float]:
+        """`count` scene frames from the one that is `start` after the first, each `every` after the one before; a
+        shorter clip repeats its last. `spread`: evenly from there to the last, at fractions of frames where need be.
+        A clip of one frame has one; none where `start` lies beyond the last."""
+        first, last = self.frame_start + start, self.frame_end
+        if first >= last:
+            return [first] if first == last else []
+        if spread and count > 1:
+            evenly = (first + (last - first) * i / (count - 1) for i in range(count))
+            return [int(f) if f == int(f) else f for f in evenly]
+        return [min(first + i * every, last) for i in range(count)]
+
+    def cut(self, count: int = 24, *, start: int = 0, every: int = 1) -> list[Clip]:
+        """Consecutive clips of `count` frames, each `every` after the one before, from the one that is `start` after
+        the first; the last is shorter, and is left out where it is one frame, in which nothing moves."""
+        span = count * every
+        starts = range(self.frame_start + start, self.frame_end + 1, span)
+        ends = [min(s + span - every, self.frame_end) for s in starts]
+        pieces = [(s, e) for s, e in zip(starts, ends, strict=True) if s < e or len(starts) == 1 or span == every]
+        if len(pieces) == 1:
+            return [replace(self, frame_start=pieces[0][0], frame_end=pieces[0][1])]
+        return [
+            replace(self, name=f"{self.name} {i:02d}", frame_start=s, frame_end=e) for i, (s, e) in enumerate(pieces, 1)
+        ]
 
 
 def find_clips(imported: bool, gone: Collection = ()) -> list[Clip]:

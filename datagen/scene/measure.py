@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TypeVar
 import bpy
 import numpy as np
 
+from ..rigs import RADIUS
 from ..sequence import InputError, Normalisation
 from .borrow import borrowed
 from .gltf import LARGEST_COORDINATE
@@ -155,8 +156,9 @@ def _show_in_viewport(layer, cleanup: contextlib.ExitStack) -> None:
 def normalisation(
     frames: list[int], objects: list | None = None, name: str = "scene", *, rendered: bool = True
 ) -> tuple[Normalisation, np.ndarray]:
-    """Bounds of the visible shapes of the open scene over all scene frames given: the Normalisation (box
-    centre, longest half-side) and the box itself, (2,3), in normalised units; `rendered` as `vertices_at` has it.
+    """Bounds of the visible shapes of the open scene over all scene frames given: the Normalisation and the box, (2,3),
+    in normalised units: its centre is the origin, its longest half-side at most 1, and no vertex farther from the
+    origin than RADIUS, which every camera of our rigs sees whole. `rendered` as `vertices_at` has it.
     Raises InputError (with `name`) where nothing is visible, a vertex is not finite or too far out, or everything
     is one point."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -172,6 +174,10 @@ def normalisation(
     centre, scale = (low + high) / 2, float((high - low).max() / 2)
     if not scale > max(1e-20, _STILL * np.abs(centre).max()):
         raise InputError(f"{name}: all vertices lie at one point; give an object that has a size.")
+    diagonal = float(np.linalg.norm(high - low)) / 2
+    if diagonal > RADIUS * scale:  # else no corner is as far
+        found = (points for parts in vertices_at(frames, objects, rendered=rendered) for _, points in parts)
+        scale = max(scale, max(float(np.linalg.norm(points - centre, axis=1).max()) for points in found) / RADIUS)
     norm = Normalisation(scale, tuple(float(x) for x in centre))
     return norm, np.stack([low - centre, high - centre]) / scale
 

@@ -334,3 +334,22 @@ def test_a_scene_that_was_enlarged_leads_back_to_the_asset(plane, tmp_path):
     b = capture(shots, tmp_path / "b", Subject([0], NORM, unit=4.0), settings)
     assert np.array_equal(a.load_image(0), b.load_image(0)) and a.normalisation == NORM
     assert b.normalisation.scale == 0.4 and np.allclose(b.normalisation.translation, np.array(NORM.translation) / 4)
+
+
+def test_between_two_frames_of_the_scene(plane, tmp_path):
+    """A clip spread over an animation: pictures, depth and motion at fractions of frames."""
+    frames = [2, 3.5, 5]
+    shots = [Shot(i, "c", "r", rigs.spherical(-20, 15, 2.4)) for i in range(3)]
+    seq = capture(shots, tmp_path / "s", Subject(frames, NORM), CaptureSettings(size=32, samples=4))
+    assert seq.fps == 24 / 1.5
+    for i, frame in enumerate(frames):
+        p, (z, flow_next, hit) = seq.load_passes(i), expected(seq.views[i], frame, 32, 32, 1.5)
+        body = inside(hit)
+        assert (
+            body.sum() > 100 and (np.abs(p.depth - z)[body] <= 1.5 * np.abs(np.gradient(z)).sum(0)[body] + 1e-4).all()
+        )
+        if i < 2:  # Blender's are those of one frame of the scene, taken as going straight on
+            assert np.abs(p.flow_next - flow_next)[body].max() < 0.15
+    tracks = seq.load_tracks()
+    at = np.array(NORM.translation) + NORM.scale * tracks.position
+    assert np.allclose(at[:, 1].mean(0) - at[:, 0].mean(0), 1.5 * STEP, atol=0.1)

@@ -20,7 +20,10 @@ def test_a_line_of_small_steps_that_stays_in_its_box(seed, count):
     new, box, shift = displace.displacements(norm, BOX, count, seed)
     assert shift.shape == (count, 3)
     assert np.allclose(np.linalg.matrix_rank(shift - shift[0], tol=1e-9), min(count - 1, 1))
-    assert np.isclose(np.abs(box).max(), 1)
+    assert np.abs(box).max() <= 1 + 1e-9
+    reach = np.minimum(np.linalg.norm(BOX, axis=1).max(), rigs.RADIUS) * norm.scale / new.scale
+    places = shift + (np.array(norm.translation) - new.translation) / new.scale
+    assert reach + np.linalg.norm(places, axis=1).max() <= rigs.RADIUS + 1e-9  # its ball stays in that of the rigs
     world = new.scale * box + new.translation
     moved = [norm.scale * BOX + norm.translation + new.scale * s for s in shift]
     assert np.allclose(world[0], np.min([m[0] for m in moved], 0))
@@ -45,7 +48,8 @@ def test_moving_the_cameras_shows_what_moving_the_object_shows(tmp_path):
         ob.location = norm.scale * d
         ob.keyframe_insert("location", frame=frame)
     again, box_again = normalisation([0, 1, 2])
-    assert np.isclose(again.scale, norm.scale) and np.allclose(box_again, box, atol=1e-5)
+    assert again.scale <= norm.scale < 1.05 * again.scale  # which knows the vertices, not the ball around them alone
+    assert np.allclose(box_again * again.scale, box * norm.scale, atol=1e-5)
     by_object = capture(shots, tmp_path / "b", Subject([0, 1, 2], norm), settings)
     for i, view in enumerate(by_camera.views):
         assert np.array_equal(view.c2w, by_object.views[i].c2w)  # the nominal camera
@@ -53,7 +57,7 @@ def test_moving_the_cameras_shows_what_moving_the_object_shows(tmp_path):
         assert np.abs(a * a[..., 3:] - b * b[..., 3:]).mean() / 255 < 1
         p, q = by_camera.load_passes(i), by_object.load_passes(i)
         body = np.isfinite(p.depth) & np.isfinite(q.depth) & (a[..., 3] == 255)
-        assert body.sum() > 200 and np.abs(p.depth[body] - q.depth[body]).mean() < 1e-3
+        assert body.sum() > 150 and np.abs(p.depth[body] - q.depth[body]).mean() < 1e-3
         for mine, blenders, end in ((p.flow_next, q.flow_next, 2), (p.flow_prev, q.flow_prev, 0)):
             if view.frame != end:  # there the clip ends: nothing moves on
                 assert np.abs(mine - blenders)[body].mean() < 0.01 and np.abs(blenders[body]).max() > 0.3

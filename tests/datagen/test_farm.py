@@ -80,6 +80,25 @@ def test_a_second_run_renders_only_what_is_missing(assets, tmp_path):
     assert (other[0] / "transforms.json").stat().st_mtime_ns != times[other[0]]
 
 
+def test_a_long_animation_in_consecutive_clips_and_spread(assets, tmp_path):
+    small = replace(SMALL, passes=False, tracks="none", clip="long way")
+    asset = [str(assets / "moving.glb")]
+    cut = replace(small, clips="consecutive", every=2, frames=2)
+    folders, _ = render_assets(asset, tmp_path / "cut", cut)
+    assert sorted(f.name for f in folders) == ["long-way-01", "long-way-02", "long-way-03"]
+    said = [read_sequence(f).provenance for f in sorted(folders)]
+    assert [p["scene_frames"] for p in said] == [[0, 2], [4, 6], [8, 10]]
+    assert len({p["cameras_seed"] for p in said}) == 3
+    times = [f.stat().st_mtime_ns for f in folders]
+    again, _ = render_assets(asset, tmp_path / "cut", cut)
+    assert sorted(again) == sorted(folders) and [f.stat().st_mtime_ns for f in folders] == times
+    (folder,), _ = render_assets(asset, tmp_path / "spread", replace(small, spread=True))
+    seq = read_sequence(folder)
+    assert np.allclose(seq.provenance["scene_frames"], [0, 10 / 3, 20 / 3, 10]) and seq.fps == pytest.approx(
+        24 * 3 / 10
+    )
+
+
 def test_still_objects_displaced(assets, tmp_path):
     settings = replace(SMALL, displace=True, rig="canonical")
     (folder,), _ = render_assets([str(assets / "still.glb")], tmp_path, settings)
@@ -174,7 +193,7 @@ def test_the_tiny_the_huge_and_what_is_said_of_a_script(odd, tmp_path):
         seq = read_sequence(folder)
         p, alpha = seq.load_passes(0), seq.load_image(0)[..., 3] / 255
         assert alpha.mean() > 0.2 and np.nanmin(p.depth) == pytest.approx(1.9, abs=0.4)
-        assert np.abs(p.flow_next[alpha == 1][:, 0]).max() > 0.3
+        assert np.abs(p.flow_next[alpha == 1][:, 0]).max() > 0.2
     a, b = (read_sequence(f).load_image(0).astype(float) for f in (ant, moon))
     assert np.abs(a - b).mean() < 20  # but for noise, whose seed is of the name
     told = read_sequence(tmp_path / "script" / "scene").provenance["warnings"]

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from timesplat.datagen.render_asset import choose_clips, most_moving_clip
+from timesplat.datagen.render_asset import choose_clips, cut_clips, most_moving_clip, scene_frames
 from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.scene.open import open_asset
 from timesplat.datagen.sequence import InputError
@@ -25,3 +25,32 @@ def test_the_clips_that_are_asked_for(two_clips):
 def test_a_clip_that_is_not_there(two_clips):
     with pytest.raises(InputError, match=r"no clip named x; it has .*slide"):
         choose_clips(open_asset(two_clips), RenderSettings(clip="x"))
+
+
+def test_long_animations_are_cut(two_clips):
+    asset = open_asset(two_clips)
+    settings = RenderSettings(clip="all", clips="consecutive", frames=8, start=2)
+    parts = cut_clips(choose_clips(asset, settings), settings, "x")
+    assert {p.name: scene_frames(p, settings) for p in parts} == {
+        "slide": [*range(2, 10)],  # frame 10 would be alone
+        "grow 01": [*range(2, 10)],
+        "grow 02": [*range(10, 18)],
+        "grow 03": [*range(18, 26)],
+        "grow 04": [26, 27, 28, 29, 30, 30, 30, 30],
+    }
+    assert parts[-1].actions
+
+
+def test_a_start_behind_the_end(two_clips):
+    asset = open_asset(two_clips)
+    settings = RenderSettings(clip="all", start=20)
+    assert [c.name for c in cut_clips(asset.clips, settings, "x")] == ["grow"]
+    for settings in (RenderSettings(start=31), RenderSettings(start=31, clips="consecutive")):
+        with pytest.raises(InputError, match=r"^x: it has 31 frames, none from --start 31 on;.*\.$"):
+            cut_clips(asset.clips, settings, "x")
+
+
+def test_what_moves_most_is_judged_by_the_frames_that_are_rendered(two_clips):
+    asset = open_asset(two_clips)
+    assert most_moving_clip(asset, RenderSettings(start=12)).name == "grow"  # slide has ended
+    assert most_moving_clip(asset, RenderSettings(spread=True)).name == "slide"

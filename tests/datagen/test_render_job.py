@@ -18,11 +18,13 @@ from timesplat.datagen.sequence import InputError
     "wrong",
     [
         *({"rig": "x"}, {"size": 7}, {"samples": 0}, {"frames": 0}, {"targets": -1}, {"seed": -1}),
+        *({"start": -1}, {"every": 0}, {"clips": "some"}),
+        *({"spread": True, "every": 2}, {"spread": True, "clips": "consecutive"}),
         *({"tracks": text} for text in ("many", "0", "-5", "1.5", "", "12345678")),
     ],
 )
 def test_settings_that_cannot_be(wrong):
-    with pytest.raises(InputError, match=rf"^--{next(iter(wrong))} [^\n]*;[^\n]*\.$"):
+    with pytest.raises(InputError, match=rf"^--{next(iter(wrong))}[ :][^\n]*;[^\n]*\.$"):
         RenderSettings(**wrong)
 
 

@@ -51,7 +51,7 @@ def test_every_rig_is_seeded_and_within_bounds(name):
         a, b = rigs.RIGS[name](frames, 5), rigs.RIGS[name](frames, 5)
         assert a and all(np.array_equal(x.c2w, y.c2w) for x, y in zip(a, b, strict=True))
         for s in a:
-            assert s.frame in frames and s.rig and 2.2 < np.linalg.norm(s.c2w[:3, 3]) < 3.6
+            assert s.frame in frames and s.rig and rigs.NEAREST - 1e-9 < np.linalg.norm(s.c2w[:3, 3]) < 3.6
     if name in ("random", "elevated", "orbit", "default"):
         c = rigs.RIGS[name](FRAMES, 6)
         assert not all(np.allclose(x.c2w, y.c2w) for x, y in zip(rigs.RIGS[name](FRAMES, 5), c, strict=True))

@@ -2,6 +2,8 @@
 import bpy
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from timesplat.datagen.scene.measure import holds_still, motion, normalisation, vertices_at
 from timesplat.datagen.scene.open import empty_session, open_asset
@@ -14,10 +16,34 @@ def test_normalisation_is_over_all_frames(two_clips):
     asset = open_asset(two_clips)
     asset.play(next(c for c in asset.clips if c.name == "slide"))
     norm, box = normalisation([0, 5, 10])  # x: -1..6, y: -1..10, z: -1..1
-    assert norm.scale == pytest.approx(5.5) and norm.translation == pytest.approx((2.5, 4.5, 0))
+    # the farthest from their middle: A's corner at its start, B's at its end
+    assert norm.scale == pytest.approx(np.sqrt(3.5**2 + 5.5**2 + 1) / 1.1) and norm.translation == pytest.approx(
+        (2.5, 4.5, 0)
+    )
     assert np.allclose(box * norm.scale + norm.translation, [[-1, -1, -1], [6, 10, 1]], atol=1e-5)
     only, _ = normalisation([0], [bpy.data.objects["A"]])
-    assert only == Normalisation(1.0, (0.0, 0.0, 0.0))
+    assert only == Normalisation(CUBE, (0.0, 0.0, 0.0))
+
+
+CUBE = float(np.sqrt(3) / 1.1)  # the scale of one of half-side 1
+
+
+@settings(max_examples=20)
+@given(st.tuples(*[st.floats(0.05, 3)] * 3), st.tuples(*[st.floats(-5, 5)] * 3))
+def test_every_vertex_is_in_the_box_and_in_the_ball(half, centre):
+    empty_session()
+    ob = cube(location=centre)
+    ob.scale = half
+    norm, box = normalisation([1])
+    radius, side = np.linalg.norm(half), max(half)
+    assert norm.scale == pytest.approx(max(side, radius / 1.1), rel=1e-4)
+    assert np.allclose(norm.translation, centre, atol=1e-4) and np.abs(box).max() <= 1 + 1e-6
+
+
+def test_a_ball_fills_the_box():
+    empty_session()
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32)
+    assert normalisation([1])[0].scale == pytest.approx(1, abs=1e-6)
 
 
 def test_instances_count_and_hidden_things_do_not():
@@ -61,7 +87,7 @@ def test_what_only_the_viewport_hides_is_measured_in_both_ways():
     ob = cube()
     ob.hide_viewport = True
     for rendered in (True, False):
-        assert normalisation([1], [ob], rendered=rendered)[0] == Normalisation(1.0, (0.0, 0.0, 0.0))
+        assert normalisation([1], [ob], rendered=rendered)[0] == Normalisation(CUBE, (0.0, 0.0, 0.0))
     assert ob.hide_viewport
 
 
@@ -80,9 +106,11 @@ def test_what_no_render_shows_does_not_count(loose):
     if loose == "beside faces":
         mesh("both", [(-1, 0, -1), (1, 0, -1), (0, 0, 1), *far], [(3, 4)], [(0, 1, 2)])
     else:
-        cube()
+        mesh("faces", [(-1, 0, -1), (1, 0, -1), (0, 0, 1)], faces=[(0, 1, 2)])
         mesh("loose", far, [(0, 1)] if loose == "edges" else [])
-    assert normalisation([1])[0] == Normalisation(1.0, (0.0, 0.0, 0.0))
+    norm, box = normalisation([1])
+    assert norm.translation == (0, 0, 0) and norm.scale == pytest.approx(np.sqrt(2) / 1.1)
+    assert np.allclose(box * norm.scale, [[-1, 0, -1], [1, 0, 1]])
     assert motion([1, 2]) == 0
 
 
