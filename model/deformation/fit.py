@@ -9,6 +9,7 @@ there. So a fit begins in the middle of the clip and goes on to its ends; motion
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -17,8 +18,8 @@ from torch import Tensor
 from ...datagen.sequence import InputError
 from ..fitting.budget import parse_budget
 from ..fitting.densify import Densifier, Pace
-from ..fitting.fit_views import detached
-from ..fitting.loop import Schedule, Step, gradients, optimise, photometric_loss, warm_up
+from ..fitting.fit_views import detached, reduction
+from ..fitting.loop import COARSE_UNTIL, Schedule, Step, gradients, optimise, photometric_loss, warm_up
 from ..fitting.parameters import Parameters
 from ..fitting.quality import Quality
 from ..geometry.silhouettes import points_inside
@@ -30,7 +31,8 @@ from .motion_table import MotionTable
 
 LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
-MAX_GAUSSIANS = 8000  # where no other number is asked for; pictures of 128² are worth no more
+PER_PIXEL = 4  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view
+MAX_GAUSSIANS = 100_000
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class DeformFit:
     """How a cloud and its motion are fitted; rates of Adam at the start and at the end, those of places in pixels."""
 
     xyz: tuple[float, float] = (0.5, 0.01)
-    scale: tuple[float, float] = (2e-2, 2e-3)
+    scale: tuple[float, float] = (3e-2, 2e-3)
     rotation: tuple[float, float] = (1e-2, 1e-3)
-    rgb: tuple[float, float] = (1e-2, 1e-3)
+    rgb: tuple[float, float] = (2e-2, 1e-3)
     opacity: tuple[float, float] = (5e-2, 5e-3)
     motion: tuple[float, float] = (0.08, 0.0036)  # in steps of a frame in model time: the more frames, the slower
     start: int = 1000  # Gaussians at the start
@@ -57,24 +59,29 @@ class DeformFit:
 
 
 FIT = DeformFit()
-PACE = Pace(every=50, since=0.2, until=0.6, share=None)
+COARSE_SIZE = 128  # longest side in pixels of the pictures at first, or half of what they are
+COARSE = Pace(every=50, since=0.1, until=0.5, share=None)  # to as many as the small pictures are worth …
+FINE = Pace(every=25, since=COARSE_UNTIL, until=0.8, share=None)  # … and then to as many as there may be
 
 
 class _Fit:
     """The state of a fit, and what its steps ask for."""
 
-    def __init__(self, views: Views, max_gaussians: int, fit: DeformFit, seed: int):
-        self.views, self.fit, self.pixel = views, fit, pixel_size(views)
+    def __init__(self, views: Views, max_gaussians: int, fit: DeformFit, coarse_size: int, seed: int):
+        self.views, self.fit, self.pixel, self.most = views, fit, pixel_size(views), max_gaussians
+        smaller = reduction(views, coarse_size)
+        self.few = max(min(round(worth(views) / smaller**2), max_gaussians), LEAST)
         self.generator = torch.Generator().manual_seed(seed)
         middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
-        xyz, rgb = points_inside(middle, max(min(fit.start, max_gaussians), LEAST), self.generator)
+        xyz, rgb = points_inside(middle, max(min(fit.start, self.few), LEAST), self.generator)
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
-        rates["xyz"] = tuple(self.pixel * r for r in fit.xyz)
+        first, last = fit.xyz
+        rates["xyz"] = first * self.pixel * smaller, last * self.pixel
         rates["motion"] = tuple(views.frame_step * r for r in fit.motion)
         values = self._start(xyz, rgb) | {"motion": self.table.zeros()}
         self.parameters = Parameters(values, rates, common=["motion"])
-        self.densifier = Densifier(self.parameters, self.generator, max_gaussians, PACE)
+        self.densifier = Densifier(self.parameters, self.generator, self.few, COARSE)
         self._place()
         self._bind()
 
@@ -104,6 +111,14 @@ class _Fit:
     def cloud(self) -> DeformingCloud:
         return DeformingCloud(self.parameters.values, self.table, self.control, self.near, self.weight)
 
+    def grown(self, fraction: float) -> DeformingCloud:
+        """A cloud of as many Gaussians as there will be at about this share of the schedule, by which it is planned."""
+        count, n = self.few if fraction < COARSE_UNTIL else self.most, len(self.near)
+        rows = torch.arange(max(count, n)) % n
+        values = {k: v if k == "motion" else v[rows] for k, v in self.parameters.values.items()}
+        values["scale"] = values["scale"] - 0.5 * math.log(len(rows) / n)
+        return DeformingCloud(values, self.table, self.control, self.near[rows], self.weight[rows])
+
     def choose(self, fraction: float, count: int) -> list[int] | None:
         """Views of the moments that the fit has come to, half of them of those that came last; later all in turn."""
         f, views = self.fit, self.views
@@ -129,11 +144,18 @@ class _Fit:
         return photometric_loss(step, f.ssim_weight) + a * cloud.opacity.mean() + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
+        if fraction >= COARSE_UNTIL and self.densifier.pace is COARSE:
+            self.densifier = Densifier(self.parameters, self.generator, self.most, FINE)
         densified = self.densifier.after_backward(number, fraction)
         if number % self.fit.place_every == 0:
             self._place()
         if densified or number % self.fit.bind_every == 0:
             self._bind()
+
+
+def worth(views: Views) -> int:
+    """How many Gaussians the pictures are worth, by the pixels that show the object in one of them; LEAST or more."""
+    return max(round(PER_PIXEL * float(views.alpha.sum((1, 2)).mean())), LEAST)
 
 
 def reconstruct_deform(
@@ -147,21 +169,22 @@ def reconstruct_deform(
     progress=None,
 ) -> Tracks4D:
     """Views (RGB and alpha alone are used) -> tracks (N,), after about `seconds`, or exactly `steps`, or those of
-    `quality`, and no more than these or the budget say. budget: "N", or "P%" of MAX_GAUSSIANS. For `progress` see
-    `optimise`. Raises InputError for the budget "auto"."""
+    `quality`, and no more than these, than the budget and than PER_PIXEL say. budget: "N", or "P%" of the most that
+    there would be without. For `progress` see `optimise`. Raises InputError for the budget "auto"."""
     if quality:
         steps = quality.steps
-    most = quality.gaussians if quality else MAX_GAUSSIANS
+    most = min(quality.gaussians if quality else MAX_GAUSSIANS, worth(views))
     if budget:
         wanted = parse_budget(budget)
         if wanted is None:
             raise InputError("deform: its budget cannot be found by itself; give a number of Gaussians.")
-        most = min(most, max(round(wanted * MAX_GAUSSIANS) if isinstance(wanted, float) else wanted, 1))
+        most = max(round(wanted * most), 1) if isinstance(wanted, float) else wanted
     with gradients():
         views = detached(views)
         warm_up("cpu")
-        state = _Fit(views, most, FIT, seed)
-        schedule = Schedule(seconds=seconds, steps=steps, coarse_size=max(views.size) // 2, seed=seed)
+        coarse_size = min(COARSE_SIZE, max(views.size) // 2)
+        state = _Fit(views, most, FIT, coarse_size, seed)
+        schedule = Schedule(seconds=seconds, steps=steps, coarse_size=coarse_size, seed=seed)
         optimise(
             state.parameters,
             state.cloud,
@@ -169,6 +192,7 @@ def reconstruct_deform(
             state.loss,
             schedule,
             choose=state.choose,
+            grown=state.grown,
             after_backward=state.after_backward,
             generator=state.generator,
             text="fitting motion and looks",

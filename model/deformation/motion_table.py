@@ -16,7 +16,7 @@ from torch import Tensor
 from .posing import Pose
 
 LEVELS = (1, 12, 48, 192, 600)  # places of each
-MOMENTS = 64  # at the most
+MOMENTS = 40  # at the most
 NEAREST = 8  # places of a level that move a point
 WIDTH = 1.5  # σ of a moment's influence, in moments: of 1 and of 2 some objects came out worse
 

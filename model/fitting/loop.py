@@ -156,6 +156,7 @@ def optimise(
     *,
     extra_views: Views | None = None,
     choose: Choose | None = None,
+    grown: Callable[[float], Gaussians4D | DynamicScene] | None = None,
     after_backward: Callable[[int, float], object] | None = None,
     generator: torch.Generator | None = None,
     text: str = "optimising",
@@ -165,7 +166,8 @@ def optimise(
 
     A step draws `scene()` from a few of the views over a random colour, and descends on `loss(step)`. `extra_views`,
     where given, make up the rest of a step's share PHOTO_SHARE of `views`. `choose(fraction, count)` may say which of
-    the views a step draws (indices), in place of all in turn in random order (None). `after_backward(number, fraction)`
+    the views a step draws (indices), in place of all in turn in random order (None). `grown(fraction)` is the scene as
+    large as it will be, where it grows much: what steps cost is measured with it. `after_backward(number, fraction)`
     may change the parameters' rows after a step, while their gradients are still there. `generator` is what `scene` and
     `loss` take random numbers from, if they do: measuring the speed leaves it as it was. `progress(fraction, text)` is
     called about ten times a second, and with a line that has "planned" in it when steps are planned for seconds.
@@ -176,7 +178,9 @@ def optimise(
         warm_up(views.rgb.device.type)
     start, done, plan = work_clock(), 0, Plan(schedule.steps or 0)
     if timed:
-        costs = _measured(parameters, scene, loss, batches, PROBE_SHARE * schedule.seconds, generator)
+        costs = _measured(
+            parameters, grown or (lambda _: scene()), loss, batches, PROBE_SHARE * schedule.seconds, generator
+        )
         plan = TimedPlan(schedule.seconds, costs, work_clock() - start, schedule.max_steps)
         report.say(0.0, f"planned {plan.steps:,} steps of {schedule.batch} views in {schedule.seconds:.3g} s")
     while True:
@@ -198,7 +202,7 @@ def optimise(
 
 def _measured(
     parameters: Parameters,
-    scene: Callable[[], Gaussians4D | DynamicScene],
+    scene: Callable[[float], Gaussians4D | DynamicScene],
     loss: Callable[[Step], Tensor],
     batches: _Batches,
     seconds: float,
@@ -214,7 +218,7 @@ def _measured(
         while len(taken) < PROBES and (not taken or sum(taken) + taken[-1] <= seconds):
             begun = work_clock()
             seen, background = batches.probe(len(taken), fraction)
-            loss(draw(scene(), seen, background, fraction)).backward()
+            loss(draw(scene(fraction), seen, background, fraction)).backward()
             for value in parameters.values.values():
                 value.grad = None
             if device.type == "cuda":

@@ -7,7 +7,7 @@ import torch
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import InputError, opengl_to_opencv
-from timesplat.model.deformation.fit import reconstruct_deform
+from timesplat.model.deformation.fit import FIT, _Fit, reconstruct_deform, worth
 from timesplat.model.fitting.quality import Quality
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.rasterize import render
@@ -57,6 +57,16 @@ def test_same_seed_same_tracks_and_a_quality_says_how_many():
     a, b, c = (reconstruct_deform(seen(0), quality=few, seed=seed) for seed in (3, 3, 4))
     assert torch.equal(a.offset, b.offset) and torch.equal(a.rgb, b.rgb) and len(a) <= 200
     assert len(a) != len(c) or not torch.equal(a.rgb, c.rgb)
+
+
+def test_there_are_few_while_pictures_are_small_and_as_many_as_they_are_worth_then():
+    views = seen(0)
+    most = round(4 * float(views.alpha.sum((1, 2)).mean()))
+    assert worth(views) == most and most > 100
+    fit = _Fit(views, most, FIT, SIZE // 2, seed=0)
+    assert fit.few == round(most / 4) and len(fit.cloud()) <= fit.few
+    assert len(fit.grown(0.0)) == fit.few and len(fit.grown(0.9)) == most
+    assert len(reconstruct_deform(views, steps=400)) > fit.few
 
 
 def test_a_budget_of_one_and_one_that_cannot_be_found():

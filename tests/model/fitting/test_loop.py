@@ -118,3 +118,29 @@ def test_what_compiles_the_kernels_draws_and_steps(monkeypatch):
     with torch.inference_mode():
         module.warm_up.__wrapped__("cpu")
     assert len(drawn) == 2 and all(alpha.max() > 0.3 for _, alpha in drawn) and drawn[0][0].requires_grad
+
+
+def test_a_plan_is_made_by_the_scene_as_large_as_it_will_be(spheres, clock):
+    """A step costs nothing now, and a second when the scene has grown; nothing of that scene is trained."""
+    with gradients():
+        views, told = detached(spheres([0, 12], size=200)), []
+        p = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)})
+
+        def grown(fraction):
+            told.append(fraction)
+            clock[0] += 1 if fraction else 0.25
+            return blob(p)
+
+        said = []
+        optimise(
+            p,
+            lambda: blob(p),
+            views,
+            photometric_loss,
+            Schedule(seconds=100, max_steps=150),
+            grown=grown,
+            progress=lambda _, text: said.append(text),
+        )
+    assert set(told) == {0.0, module.COARSE_UNTIL}
+    steps = (100 - told.count(0.0) / 4 - told.count(module.COARSE_UNTIL)) / (0.6 * 0.25 + 0.4)
+    assert said[0] == f"optimising: planned {min(round(steps), 150)} steps of 2 views in 100 s" and steps > 150
