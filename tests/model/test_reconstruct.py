@@ -40,7 +40,7 @@ def test_the_method_that_suits_what_was_rendered(sphere_folder, tmp_path):
     assert chosen_method(nothing, None) == chosen_method(nothing, "tracks") == "guided"
     assert chosen_method(followed, "lift") == chosen_method(nothing, "lift") == "lift"
     bare = replace(seq, views=[replace(v, passes=None) for v in seq.views])
-    assert chosen_method(bare, None) == "rgb"
+    assert chosen_method(bare, None) == "deform"
     assert untracked_note(seq) == "" and "Smoke, Fire: " in untracked_note(replace(seq, untracked=["Smoke", "Fire"]))
 
 
