@@ -18,6 +18,7 @@ from .posing import Pose
 LEVELS = (1, 12, 48, 192, 600)  # places of each
 MOMENTS = 40  # at the most
 NEAREST = 8  # places of a level that move a point
+BEYOND = 2  # moments before the clip, and after it
 WIDTH = 1.5  # σ of a moment's influence, in moments: of 1 and of 2 some objects came out worse
 
 
@@ -41,7 +42,7 @@ class MotionTable:
 
     levels: list[Tensor]  # (P_l,3) places of each, at rest; P in all
     reach: list[float]  # σ of a place's influence, of each level
-    moments: Tensor  # (M,) model times, evenly from -1 to 1
+    moments: Tensor  # (M,) model times, evenly from before -1 to after 1, so that the ends are smoothed like the rest
 
     @staticmethod
     def around(points: Tensor, frames: int, generator: torch.Generator) -> MotionTable:
@@ -49,7 +50,8 @@ class MotionTable:
         levels = [spread_points(points, n, generator) for n in LEVELS if n <= len(points)]
         reach = [2.0] + [float(torch.cdist(p, p).topk(2, largest=False).values[:, 1].median()) for p in levels[1:]]
         count = min(max(frames, 2), MOMENTS)
-        return MotionTable(levels, [max(r, 1e-3) for r in reach], torch.linspace(-1, 1, count))
+        last = 1 + BEYOND * 2 / (count - 1)
+        return MotionTable(levels, [max(r, 1e-3) for r in reach], torch.linspace(-last, last, count + 2 * BEYOND))
 
     def zeros(self) -> Tensor:
         """The values at rest."""
@@ -69,7 +71,7 @@ class MotionTable:
 
     def pose(self, values: Tensor, weights: tuple[Tensor, Tensor], points: Tensor, t: float) -> tuple[Tensor, Tensor]:
         """Where points (C,3) with these weights are at time t (C,3), and their unit quaternions (C,4)."""
-        apart = 2 / (len(self.moments) - 1)
+        apart = float(self.moments[1] - self.moments[0])
         share = torch.exp(-0.5 * ((t - self.moments) / (WIDTH * apart)).square())
         now = (share > 1e-3 * share.max()).nonzero()[:, 0]
         return Pose.apply(now.int(), share[now] / share[now].sum(), *weights, points, values)
