@@ -171,7 +171,7 @@ def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
     add_arguments(p)
     p.add_argument("--method", help="tracks, lift, guided, deform, rgb, sweep, predicted, 4dgs (default: tracks "
-                   "where the renderer wrote surface tracks, else guided where it wrote depth, else deform)")  # fmt: skip
+                   "where there are surface tracks, else guided where there is depth, else deform)")  # fmt: skip
     p.add_argument("--quality", help="how much is fitted, and the same comes out however busy the machine is: the "
                    "longest side of the pictures, steps, most Gaussians. The pictures are averaged down by a whole "
                    "factor; a method that gains nothing from so many steps or Gaussians takes fewer; one that does not "
