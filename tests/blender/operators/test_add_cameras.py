@@ -28,7 +28,8 @@ keyed = {o.name: bool(o.animation_data) for o in bpy.data.collections["Timesplat
 tell(done=list(done), poses=poses(), keyed=keyed, selected=[o.name for o in bpy.context.selected_objects],
      fov=[float(np.degrees(o.data.angle)) for o in bpy.data.collections["Timesplat Cameras"].objects])
 """
-BOX = Normalisation(1.5, (4.0, -1.0, 2.0))
+CORNER = float(np.linalg.norm([1, 1, 1.5]))  # how far the box's corners are from its middle
+BOX = Normalisation(CORNER / rigs.RADIUS, (4.0, -1.0, 2.0))
 NUMBERS = range(5)
 EXPECTED = {
     "CANONICAL": ({}, rigs.canonical(NUMBERS)),
