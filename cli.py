@@ -175,11 +175,11 @@ def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--quality", help="how much is fitted, and the same comes out however busy the machine is: the "
                    "longest side of the pictures, steps, most Gaussians. The pictures are averaged down by a whole "
                    "factor; a method that gains nothing from so many steps or Gaussians takes fewer; one that does not "
-                   f"fit is refined. {meanings}. (default: none, --seconds and --refine hold)")  # fmt: skip
+                   f"fit is refined. {meanings}. (default: for deform balanced, else none)")  # fmt: skip
     p.add_argument("--steps", type=int, help="exactly so many steps of the method's own fit, or of refinement where it "
                    "has none; in place of --quality")  # fmt: skip
-    p.add_argument("--seconds", type=float, help="for methods that fit the scene: tracks, 4dgs; as many steps are "
-                   "planned as fit (default: 10)")  # fmt: skip
+    p.add_argument("--seconds", type=float, help="for methods that fit the scene: tracks, deform, 4dgs; as many "
+                   "steps are planned as fit (default: 10)")  # fmt: skip
     p.add_argument("--refine", type=float, default=0.0, help="seconds of fitting the result to the views (default: 0)")
     p.add_argument("--seed", type=int, default=0, help="of all that is random in fits (default: 0)")
     p.add_argument("--budget", help="most Gaussians: a number, a share of those predicted such as 10%%, or auto: as "
@@ -234,6 +234,8 @@ def reconstruct(args: argparse.Namespace) -> int:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else all_inputs(seq)
     method = method_named(chosen_method(seq, args.method, indices))
+    if method.name == "deform" and args.seconds is None and not (args.refine or options.counted):
+        options = replace(options, quality="balanced")  # ten seconds are not enough, and 800 pixels more than is needed
     with _bar() as progress:
         g = run(seq, method.name, indices, options, progress, size=args.size)
     write_ply(args.out, g.to_asset(clip_of(seq)))

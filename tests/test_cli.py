@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from timesplat.cli import COMMANDS, main
+from timesplat.datagen.sequence import InputError
 from timesplat.model.io.ply import read_ply, write_ply
 
 from .assets import assert_same, make_asset, tracked_asset
@@ -64,6 +65,23 @@ def test_a_reader_that_leaves_early_is_no_fault(tmp_path, words, how, errors_too
     if not errors_too:
         assert (b"b.obj: " in done.stderr and done.stderr.count(b"\n") == 1) if refused else done.stderr == b""
     assert ((tmp_path / "b.ply").exists()) == ("b.ply" in words)
+
+
+def test_pictures_alone_are_fitted_as_well_as_is_sensible_unless_it_is_said_how_long(pictures, tmp_path, monkeypatch):
+    from timesplat.model import reconstruct as module
+
+    asked = []
+
+    def stop(sequence, method, indices, options, progress, size=None):
+        asked.append((method, options.quality, options.steps))
+        raise InputError("enough")
+
+    monkeypatch.setattr(module, "reconstruct", stop)
+    command = ["reconstruct", str(pictures), "--out", str(tmp_path / "out.ply")]
+    for told in ([], ["--steps", "7"], ["--seconds", "3"], ["--refine", "3"], ["--quality", "draft"]):
+        assert main([*command, *told]) == 2
+    named = [("deform", q, s) for q, s in (("balanced", None), (None, 7), (None, None), (None, None), ("draft", None))]
+    assert asked == named
 
 
 def test_missing_and_damaged_sequences(sphere_folder, tmp_path, capsys):
