@@ -234,8 +234,8 @@ def reconstruct(args: argparse.Namespace) -> int:
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else all_inputs(seq)
     method = method_named(chosen_method(seq, args.method, indices))
-    if method.name == "deform" and args.seconds is None and not (args.refine or options.counted):
-        options = replace(options, quality="balanced")  # ten seconds are not enough, and 800 pixels more than is needed
+    if args.seconds is None and not (args.refine or options.counted):
+        options = replace(options, quality=method.quality)
     with _bar() as progress:
         g = run(seq, method.name, indices, options, progress, size=args.size)
     write_ply(args.out, g.to_asset(clip_of(seq)))

@@ -86,10 +86,11 @@ def agreement(seq: Sequence) -> str:
     around = f"they see {coverage(seq):.0%} of its sides"
     if not shows_object(seq):
         place = np.array([v.c2w[:3, 3] for v in seq.views])
-        met = volume.common_point(place, np.array([-v.c2w[:3, 2] for v in seq.views]))
+        axis = np.array([-v.c2w[:3, 2] for v in seq.views])
+        met = volume.common_point(place, axis)
         if met is None:
             return "the cameras all look the same way"
-        off = _miss(place, np.array([-v.c2w[:3, 2] for v in seq.views]), met[0]) / np.median(met[1])
+        off = _miss(place, axis, met[0]) / np.median(met[1])
         front = (met[1] > 0).mean()
         return (
             f"{front:.0%} of the cameras look at one place, their axes pass it at {off:.0%} of its distance; {around}"

@@ -67,9 +67,11 @@ FINE = Pace(every=25, since=COARSE_UNTIL, until=0.8, share=None)  # … and then
 class _Fit:
     """The state of a fit, and what its steps ask for."""
 
-    def __init__(self, views: Views, max_gaussians: int, fit: DeformFit, coarse_size: int, seed: int):
-        self.views, self.fit, self.pixel, self.most = views, fit, pixel_size(views), max_gaussians
-        smaller = reduction(views, coarse_size)
+    def __init__(self, views: Views, max_gaussians: int, seed: int):
+        fit = self.fit = FIT
+        self.views, self.pixel, self.most = views, pixel_size(views), max_gaussians
+        self.coarse_size = min(COARSE_SIZE, max(views.size) // 2)
+        smaller = reduction(views, self.coarse_size)
         self.few = max(min(round(worth(views) / smaller**2), max_gaussians), LEAST)
         self.generator = torch.Generator().manual_seed(seed)
         middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
@@ -182,9 +184,8 @@ def reconstruct_deform(
     with gradients():
         views = detached(views)
         warm_up("cpu")
-        coarse_size = min(COARSE_SIZE, max(views.size) // 2)
-        state = _Fit(views, most, FIT, coarse_size, seed)
-        schedule = Schedule(seconds=seconds, steps=steps, coarse_size=coarse_size, seed=seed)
+        state = _Fit(views, most, seed)
+        schedule = Schedule(seconds=seconds, steps=steps, coarse_size=state.coarse_size, seed=seed)
         optimise(
             state.parameters,
             state.cloud,

@@ -7,7 +7,7 @@ import torch
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import InputError, opengl_to_opencv
-from timesplat.model.deformation.fit import FIT, _Fit, reconstruct_deform, worth
+from timesplat.model.deformation.fit import _Fit, reconstruct_deform, worth
 from timesplat.model.fitting.quality import Quality
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.rasterize import render
@@ -63,7 +63,7 @@ def test_there_are_few_while_pictures_are_small_and_as_many_as_they_are_worth_th
     views = seen(0)
     most = round(4 * float(views.alpha.sum((1, 2)).mean()))
     assert worth(views) == most and most > 100
-    fit = _Fit(views, most, FIT, SIZE // 2, seed=0)
+    fit = _Fit(views, most, seed=0)
     assert fit.few == round(most / 4) and len(fit.cloud()) <= fit.few
     assert len(fit.grown(0.0)) == fit.few and len(fit.grown(0.9)) == most
     assert len(reconstruct_deform(views, steps=400)) > fit.few
