@@ -19,7 +19,7 @@ from ...datagen.sequence import InputError
 from ..fitting.budget import parse_budget
 from ..fitting.densify import Densifier, Pace
 from ..fitting.fit_views import detached, reduction
-from ..fitting.loop import COARSE_UNTIL, Schedule, Step, gradients, optimise, photometric_loss, warm_up
+from ..fitting.loop import Pyramid, Schedule, Step, gradients, optimise, photometric_loss, warm_up
 from ..fitting.parameters import Parameters
 from ..fitting.quality import Quality
 from ..geometry.silhouettes import points_inside
@@ -59,9 +59,33 @@ class DeformFit:
 
 
 FIT = DeformFit()
-COARSE_SIZE = 128  # longest side in pixels of the pictures at first, or half of what they are
-COARSE = Pace(every=50, since=0.1, until=0.5, share=None)  # to as many as the small pictures are worth …
-FINE = Pace(every=25, since=COARSE_UNTIL, until=0.8, share=None)  # … and then to as many as there may be
+SMALLEST = 128  # pixels of the longest side, from which pictures grow to what they are
+SHARES = {1: (0.6,), 2: (0.5, 0.8), 3: (0.4, 0.7, 0.9)}  # of the schedule after which they do, by how often
+
+
+def pyramid_of(longest: int) -> Pyramid:
+    """Sizes of pictures whose longest side has so many pixels in the end: each half of the next, once at least."""
+    halvings = min(max(math.ceil(math.log2(longest / SMALLEST)), 1), max(SHARES))
+    return tuple((until, -(-longest // 2 ** (halvings - i))) for i, until in enumerate(SHARES[halvings]))
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """The part of a schedule in which pictures have one size."""
+
+    until: float  # share of the schedule
+    gaussians: int  # that there are at its end
+    pace: Pace  # by which there come to be so many
+
+
+def _stages(pyramid: Pyramid, views: Views, most: int) -> list[_Stage]:
+    stages, since = [], 0.0
+    for until, size in (*pyramid, (1.0, max(views.size))):
+        worthwhile = round(worth(views) / reduction(views, size) ** 2)
+        grow = Pace(25, since, (since + until) / 2, None) if stages else Pace(50, 0.1, 0.83 * until, None)
+        stages.append(_Stage(until, max(min(worthwhile, most), LEAST), grow))
+        since = until
+    return stages
 
 
 class _Fit:
@@ -69,13 +93,14 @@ class _Fit:
 
     def __init__(self, views: Views, max_gaussians: int, seed: int):
         fit = self.fit = FIT
-        self.views, self.pixel, self.most = views, pixel_size(views), max_gaussians
-        self.coarse_size = min(COARSE_SIZE, max(views.size) // 2)
-        smaller = reduction(views, self.coarse_size)
-        self.few = max(min(round(worth(views) / smaller**2), max_gaussians), LEAST)
+        self.views, self.pixel = views, pixel_size(views)
+        self.pyramid = pyramid_of(max(views.size))
+        smaller = reduction(views, self.pyramid[0][1])
+        self.stages = _stages(self.pyramid, views, max_gaussians)
+        self.stage = self.stages[0]
         self.generator = torch.Generator().manual_seed(seed)
         middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
-        xyz, rgb = points_inside(middle, max(min(fit.start, self.few), LEAST), self.generator)
+        xyz, rgb = points_inside(middle, min(fit.start, self.stage.gaussians), self.generator)
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
         first, last = fit.xyz
@@ -83,7 +108,7 @@ class _Fit:
         rates["motion"] = tuple(views.frame_step * r for r in fit.motion)
         values = self._start(xyz, rgb) | {"motion": self.table.zeros()}
         self.parameters = Parameters(values, rates, common=["motion"])
-        self.densifier = Densifier(self.parameters, self.generator, self.few, COARSE)
+        self.densifier = self._densifier()
         self._place()
         self._bind()
 
@@ -110,12 +135,18 @@ class _Fit:
     def _bind(self) -> None:
         self.near, self.weight = self.control.influence(self.parameters["xyz"].detach())
 
+    def _at(self, fraction: float) -> _Stage:
+        return next((stage for stage in self.stages if fraction < stage.until), self.stages[-1])
+
+    def _densifier(self) -> Densifier:
+        return Densifier(self.parameters, self.generator, self.stage.gaussians, self.stage.pace)
+
     def cloud(self) -> DeformingCloud:
         return DeformingCloud(self.parameters.values, self.table, self.control, self.near, self.weight)
 
     def grown(self, fraction: float) -> DeformingCloud:
         """A cloud of as many Gaussians as there will be at about this share of the schedule, by which it is planned."""
-        count, n = self.few if fraction < COARSE_UNTIL else self.most, len(self.near)
+        count, n = self._at(fraction).gaussians, len(self.near)
         rows = torch.arange(max(count, n)) % n
         values = {k: v if k == "motion" else v[rows] for k, v in self.parameters.values.items()}
         values["scale"] = values["scale"] - 0.5 * math.log(len(rows) / n)
@@ -146,8 +177,9 @@ class _Fit:
         return photometric_loss(step, f.ssim_weight) + a * cloud.opacity.mean() + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
-        if fraction >= COARSE_UNTIL and self.densifier.pace is COARSE:
-            self.densifier = Densifier(self.parameters, self.generator, self.most, FINE)
+        if self._at(fraction) is not self.stage:
+            self.stage = self._at(fraction)
+            self.densifier = self._densifier()
         densified = self.densifier.after_backward(number, fraction)
         if number % self.fit.place_every == 0:
             self._place()
@@ -185,7 +217,7 @@ def reconstruct_deform(
         views = detached(views)
         warm_up("cpu")
         state = _Fit(views, most, seed)
-        schedule = Schedule(seconds=seconds, steps=steps, coarse_size=state.coarse_size, seed=seed)
+        schedule = Schedule(seconds=seconds, steps=steps, pyramid=state.pyramid, seed=seed)
         optimise(
             state.parameters,
             state.cloud,

@@ -104,7 +104,7 @@ def find_fewest(
         held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
         fitted, unseen = views[[i for i in range(len(views)) if i not in held_out] or held_out], views[held_out]
         extra_views = views_around(g, views) if has_depth else None
-        schedule = Schedule(seconds=TRY_SECONDS, steps=steps, coarse_size=None, seed=seed)
+        schedule = Schedule(seconds=TRY_SECONDS, steps=steps, pyramid=(), seed=seed)
         tried: list[tuple[int, float]] = []
         number = FIRST_TRY
         while number < len(g):

@@ -24,6 +24,7 @@ from .photometric import photometric_error
 from .plan import PROBE_SHARE, Costs, Plan, TimedPlan
 
 COARSE, COARSE_UNTIL = 160, 0.6  # longest side in pixels of what is drawn in this first part of the schedule
+Pyramid = tuple[tuple[float, int], ...]  # up to which share of a schedule pictures have what longest side at the most
 PROBES = 5  # steps at the most, of each size of pictures, by which the speed is measured
 PHOTO_SHARE = (0.2, 0.8)  # share of a step's views that are photographs, at the start and the end, beside extra views
 
@@ -36,7 +37,7 @@ class Schedule:
     steps: int | None = None  # exactly so many, in place of seconds: then the result is the same on every run
     max_steps: int | None = None  # time that is left after these stays unused
     batch: int = 2  # views of a step
-    coarse_size: int | None = COARSE  # longest side in pixels of the pictures at first; None: as they are, always
+    pyramid: Pyramid = ((COARSE_UNTIL, COARSE),)  # pictures are small at first; after the last share as they are
     seed: int = 0
 
 
@@ -89,17 +90,22 @@ class _Batches:
         self.choose = choose
         count, self.extra, self.size = len(views), extra_views is not None, schedule.batch
         self.views = joined(views, extra_views) if self.extra else views
-        self.coarse = downsampled(self.views, reduction(self.views, schedule.coarse_size or max(self.views.size)))
+        by = [(until, reduction(self.views, size)) for until, size in schedule.pyramid]
+        self.levels = [(until, downsampled(self.views, n)) for until, n in by if n > 1] + [(1.0, self.views)]
         self.generator = torch.Generator().manual_seed(schedule.seed)
         self.photographs = _Turns(0, count, self.generator)
         self.others = _Turns(count, len(self.views), self.generator)
+
+    def at(self, fraction: float) -> Views:
+        """All views, of the size that is drawn at this share of the schedule."""
+        return next((views for until, views in self.levels if fraction < until), self.views)
 
     def take(self, fraction: float) -> tuple[Views, Tensor]:
         """-> the views, and the background (3,)."""
         chosen = self.choose(fraction, self.size) if self.choose else None
         if chosen is None:
             chosen = self._in_turn(fraction)
-        views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
+        views = self.at(fraction)[chosen]
         return views, torch.rand(3, generator=self.generator).to(views.rgb)
 
     def _in_turn(self, fraction: float) -> list[int]:
@@ -114,7 +120,7 @@ class _Batches:
         """Views and background as above, of the `number`-th step of those by which the speed is measured; nothing is
         taken for it."""
         chosen = [(number * self.size + i) * 7919 % len(self.views) for i in range(self.size)]  # all over the clip
-        views = (self.coarse if fraction < COARSE_UNTIL else self.views)[chosen]
+        views = self.at(fraction)[chosen]
         return views, views.rgb.new_full((3,), 0.5)
 
 
@@ -208,7 +214,7 @@ def _measured(
     seconds: float,
     generator: torch.Generator | None,
 ) -> Costs:
-    """What a step costs with small pictures and with whole ones: the median of some, taken as far as their gradients,
+    """What a step costs with pictures of each size: the median of some, taken as far as their gradients,
     that leave parameters and random numbers as they were. They take about so many seconds, or a step."""
     device = batches.views.rgb.device
     state = generator.get_state() if generator else None
@@ -226,14 +232,18 @@ def _measured(
             taken.append(work_clock() - begun)
         return sorted(taken)[(len(taken) - 1) // 2]
 
+    stages, since, pixels = [], 0.0, 0
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        coarse = full = cost(0.0, seconds / 2)
-        larger = batches.views.alpha[0].numel() / batches.coarse.alpha[0].numel()
-        if larger > 1:  # steps that would take too long are taken to cost by their pixels
-            full = cost(COARSE_UNTIL, seconds / 2) if larger * coarse <= seconds else larger * coarse
+        for until, views in batches.levels:
+            share = seconds / len(batches.levels)
+            larger = views.alpha[0].numel() / pixels if stages else 1.0
+            # Steps that would take too long are taken to cost by their pixels.
+            expected = larger * stages[-1][1] if stages else 0.0
+            stages.append((until, expected if expected > 2 * share else cost(since, share)))
+            since, pixels = until, views.alpha[0].numel()
     if generator:
         generator.set_state(state)
-    return Costs(coarse, full, COARSE_UNTIL)
+    return Costs(tuple(stages))
 
 
 @cache

@@ -21,20 +21,21 @@ LEAST_CHANGE = 0.02  # of what is left, for which a plan is corrected
 class Costs:
     """Seconds of a step by the share of the schedule that is done."""
 
-    coarse: float  # of small pictures, which are drawn first …
-    full: float
-    until: float  # … up to this share 0..1
+    stages: tuple[tuple[float, float], ...]  # up to which share, and the seconds; in order, the last up to 1
 
     def at(self, fraction: float) -> float:
-        return self.coarse if fraction < self.until else self.full
+        return next((seconds for until, seconds in self.stages if fraction < until), self.stages[-1][1])
 
     def mean(self, fraction: float) -> float:
-        """Of all steps from this share on."""
-        small = max(self.until - fraction, 0) / (1 - fraction)
-        return small * self.coarse + (1 - small) * self.full
+        """Of all steps from this share, less than 1, on."""
+        total, since = 0.0, fraction
+        for until, seconds in self.stages:
+            total += max(until - since, 0) * seconds
+            since = max(until, since)
+        return total / (1 - fraction)
 
     def times(self, factor: float) -> Costs:
-        return Costs(factor * self.coarse, factor * self.full, self.until)
+        return Costs(tuple((until, factor * seconds) for until, seconds in self.stages))
 
 
 class Plan:

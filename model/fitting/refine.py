@@ -26,7 +26,7 @@ from ..parallel import work_clock
 from ..views import Views
 from .densify import Densifier
 from .fit_views import detached, downsampled, reduction, squared_error, validation_views, views_around
-from .loop import Schedule, Step, gradients, optimise, photometric_loss, warm_up
+from .loop import COARSE_UNTIL, Schedule, Step, gradients, optimise, photometric_loss, warm_up
 from .merge import merge_gaussians
 from .parameters import RATES, Parameters, activate, raw_parameters
 
@@ -191,7 +191,7 @@ def refine(
             schedule = Schedule(
                 seconds=first * seconds,
                 steps=None if steps is None else round(first * steps),
-                coarse_size=None,
+                pyramid=(),
                 seed=seed,
             )
             error, moved = fit(raw_parameters(g), ALL.rates, views, schedule, progress=part(progress, 0, first))
@@ -203,7 +203,7 @@ def refine(
                 seconds=max(seconds - (work_clock() - began), 0.5 * (1 - first) * seconds),
                 steps=None if steps is None else steps - round(first * steps),
                 max_steps=few.max_steps,
-                coarse_size=max(-(-max(views.size) // 2), SMALL),
+                pyramid=((COARSE_UNTIL, max(-(-max(views.size) // 2), SMALL)),),
                 seed=seed,
             )
             told = part(progress, first, 1)

@@ -60,7 +60,7 @@ def reconstruct_tracks(
     start = surface_tracks(surface, views, count)
     if not (seconds or steps) or not len(start):
         return start
-    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, coarse_size=None, seed=seed)
+    schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, pyramid=(), seed=seed)
     told = part(progress, search, 1)
     warm_up("cpu")
     fitted = fit_tracks(start, views, schedule, pixel=pixel_size(views), progress=told)
@@ -92,7 +92,7 @@ def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None)
     kept = [i for i in range(len(views)) if i not in held_out] or held_out
     fitted, unseen = views[kept], views[held_out]
     most, count, tried = needed_points(surface, views), FIRST_TRY, []
-    schedule = Schedule(steps=TRY_STEPS, coarse_size=None)
+    schedule = Schedule(steps=TRY_STEPS, pyramid=())
     while count < most:
         told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
         start = surface_tracks(surface, fitted, count)

@@ -7,7 +7,7 @@ import torch
 
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import InputError, opengl_to_opencv
-from timesplat.model.deformation.fit import _Fit, reconstruct_deform, worth
+from timesplat.model.deformation.fit import _Fit, pyramid_of, reconstruct_deform, worth
 from timesplat.model.fitting.quality import Quality
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.rasterize import render
@@ -64,9 +64,21 @@ def test_there_are_few_while_pictures_are_small_and_as_many_as_they_are_worth_th
     most = round(4 * float(views.alpha.sum((1, 2)).mean()))
     assert worth(views) == most and most > 100
     fit = _Fit(views, most, seed=0)
-    assert fit.few == round(most / 4) and len(fit.cloud()) <= fit.few
-    assert len(fit.grown(0.0)) == fit.few and len(fit.grown(0.9)) == most
-    assert len(reconstruct_deform(views, steps=400)) > fit.few
+    few = round(most / 4)
+    assert [stage.gaussians for stage in fit.stages] == [few, most] and len(fit.cloud()) <= few
+    assert len(fit.grown(0.0)) == few and len(fit.grown(0.9)) == most
+    assert len(reconstruct_deform(views, steps=400)) > few
+
+
+def test_pictures_double_from_about_128_pixels_to_their_own_size():
+    assert [[size for _, size in pyramid_of(n)] for n in (64, 128, 256, 400, 512)] == [
+        [32],
+        [64],
+        [128],
+        [100, 200],
+        [128, 256],
+    ]
+    assert [size for _, size in pyramid_of(1024)] == [128, 256, 512] == [size for _, size in pyramid_of(1023)]
 
 
 def test_a_budget_of_one_and_one_that_cannot_be_found():

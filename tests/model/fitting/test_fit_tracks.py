@@ -10,7 +10,7 @@ from timesplat.model.fitting.fit_tracks import activate_tracks, fit_tracks, raw_
 from timesplat.model.fitting.loop import Schedule
 from timesplat.model.geometry.surface_tracks import pixel_size, surface_tracks
 
-STEPS = Schedule(steps=40, coarse_size=None)
+STEPS = Schedule(steps=40, pyramid=())
 
 
 def test_raw_and_back():

@@ -22,7 +22,7 @@ def gone_through(plan: Plan, cost, start: float = 0.0) -> tuple[int, float, list
 
 
 def even(seconds: float) -> Costs:
-    return Costs(seconds, seconds, 0.6)
+    return Costs(((1.0, seconds),))
 
 
 def largest_change(shares: list[float]) -> float:
@@ -48,7 +48,7 @@ def test_a_slow_machine_plans_fewer_steps(each):
 
 
 def test_small_pictures_count_for_what_they_cost_and_measuring_too():
-    plan = TimedPlan(10, Costs(0.01, 0.04, 0.6), elapsed=0.5)
+    plan = TimedPlan(10, Costs(((0.6, 0.01), (1.0, 0.04))), elapsed=0.5)
     assert plan.steps == round(9.5 / (0.6 * 0.01 + 0.4 * 0.04))
     done, elapsed, _, _ = gone_through(plan, lambda _, f: 0.01 if f < 0.6 else 0.04, 0.5)
     assert elapsed == pytest.approx(10, rel=0.02) and done == plan.steps
