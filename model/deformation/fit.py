@@ -4,7 +4,8 @@ share, moved by control points (SC-GS, Huang et al. 2024), and both fitted to th
 
 Where things move fast, what a view shows is far from where it was in the views that are known, and no gradient leads
 there. So a fit begins in the middle of the clip and goes on to its ends; motion is a table of several levels
-(`motion_table.py`); pictures are small at first; and neighbours are held together less and less.
+(`motion_table.py`), smooth in time until all of the clip is looked at, and sharper then; pictures are small at first;
+and neighbours are held together less and less.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ..geometry.surface_tracks import pixel_size
 from ..tracks import Tracks4D
 from ..views import Views
 from .cloud import SEEN, ControlPoints, DeformingCloud
-from .motion_table import MotionTable
+from .motion_table import SEVERAL, SHARP, MotionTable
 
 LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
@@ -99,6 +100,7 @@ class _Fit:
         self.stages = _stages(self.pyramid, views, max_gaussians)
         self.stage = self.stages[0]
         self.generator = torch.Generator().manual_seed(seed)
+        self.sharp = SHARP[len(views) >= SEVERAL * len(views.time.unique())]
         middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
         xyz, rgb = points_inside(middle, min(fit.start, self.stage.gaussians), self.generator)
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
@@ -177,6 +179,8 @@ class _Fit:
         return photometric_loss(step, f.ssim_weight) + a * cloud.opacity.mean() + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
+        if fraction >= self.fit.window and self.table.width > self.sharp:
+            self.table.sharpen(self.parameters["motion"].detach(), self.sharp)
         if self._at(fraction) is not self.stage:
             self.stage = self._at(fraction)
             self.densifier = self._densifier()

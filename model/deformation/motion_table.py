@@ -19,7 +19,9 @@ LEVELS = (1, 12, 48, 192, 600)  # places of each
 MOMENTS = 40  # at the most
 NEAREST = 8  # places of a level that move a point
 BEYOND = 2  # moments before the clip, and after it
-WIDTH = 1.5  # σ of a moment's influence, in moments: of 1 and of 2 some objects came out worse
+WIDTH = 1.5  # σ of a moment's influence, in moments, while motion is looked for …
+SHARP = 1.0, 0.7  # … and when it is found, where a time is seen by one view, and by SEVERAL
+SEVERAL = 4
 
 
 def spread_points(points: Tensor, count: int, generator: torch.Generator, among: int = 20_000) -> Tensor:
@@ -53,6 +55,21 @@ class MotionTable:
         last = 1 + BEYOND * 2 / (count - 1)
         return MotionTable(levels, [max(r, 1e-3) for r in reach], torch.linspace(-last, last, count + 2 * BEYOND))
 
+    width: float = WIDTH  # σ of a moment's influence, in moments
+
+    def _share(self, t: Tensor) -> Tensor:
+        """t (T,) -> how much each moment counts then (T,M), in all 1."""
+        apart = float(self.moments[1] - self.moments[0])
+        share = torch.exp(-0.5 * ((t[:, None] - self.moments) / (self.width * apart)).square())
+        return share / share.sum(1, keepdim=True)
+
+    @torch.no_grad()
+    def sharpen(self, values: Tensor, width: float) -> None:
+        """Has each moment count over a shorter time from now on; values (M,P,6) become what they came to at their
+        moments, so that the motion stays about as it is."""
+        values.copy_(torch.einsum("mn,npc->mpc", self._share(self.moments), values))
+        self.width = width
+
     def zeros(self) -> Tensor:
         """The values at rest."""
         return torch.zeros(len(self.moments), sum(map(len, self.levels)), 6)
@@ -71,7 +88,6 @@ class MotionTable:
 
     def pose(self, values: Tensor, weights: tuple[Tensor, Tensor], points: Tensor, t: float) -> tuple[Tensor, Tensor]:
         """Where points (C,3) with these weights are at time t (C,3), and their unit quaternions (C,4)."""
-        apart = float(self.moments[1] - self.moments[0])
-        share = torch.exp(-0.5 * ((t - self.moments) / (WIDTH * apart)).square())
+        share = self._share(torch.tensor([t]))[0]
         now = (share > 1e-3 * share.max()).nonzero()[:, 0]
         return Pose.apply(now.int(), share[now] / share[now].sum(), *weights, points, values)

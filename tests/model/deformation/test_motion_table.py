@@ -41,6 +41,26 @@ def test_what_a_place_does_is_done_near_it_then():
     assert (table.pose(values, table.weights(far), far, float(table.moments[2]))[0] - far).abs().max() < 1e-3
 
 
+def test_motion_stays_about_as_it_is_when_moments_count_over_a_shorter_time_and_may_be_faster_then():
+    table, points = a_table()
+    weights, values = table.weights(points), table.zeros()
+    wave = torch.sin(2 * table.moments)
+    values[..., 0] = wave[:, None] / len(table.levels)
+
+    def moved():
+        return torch.stack([table.pose(values, weights, points, t)[0] - points for t in (-1.0, -0.37, 0.2, 1.0)])
+
+    before = moved()
+    table.sharpen(values, 0.7)
+    assert (moved() - before).abs().max() < 0.05 * before.abs().max()
+    values.zero_()
+    values[5, :, 0] = 1.0
+    peak = [float((table.pose(values, weights, points[:1], float(table.moments[5]))[0] - points[:1])[0, 0])]
+    table.width = 1.5
+    peak.append(float((table.pose(values, weights, points[:1], float(table.moments[5]))[0] - points[:1])[0, 0]))
+    assert peak[0] > 1.5 * peak[1]
+
+
 def test_spread_points_lie_apart():
     _, points = a_table()
     g = torch.Generator().manual_seed(1)
