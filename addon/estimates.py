@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 from .settings import cameras, frames
 
-# Gaussians a pixel that counts (`_pixels_that_count`): the mean of 12 objects (tracks: 7), until one was made here
-_gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "rgb": 0.11}
+# Gaussians a pixel that counts (`_pixels_that_count`): the mean of 12 objects (tracks: 7, deform: 4), until one is made
+_gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "deform": 0.4}
 TRACKED = (4000, 100_000)  # fewest and most points that are followed
 START_SECONDS = 3.0  # of a process
 FIT_SECONDS = 5.0  # of a budget's own fit, of pictures of USUAL_PIXELS
 USUAL_PIXELS = 128**2  # of a picture
 USUAL_GAUSSIANS = 4000  # that a fit of pictures of USUAL_PIXELS uses at most, and in proportion to their sides
-SECONDS_A_PIXEL = {"tracks": 1e-6, "guided": 1.3e-6, "lift": 8e-7, "rgb": 1.8e-6}  # seconds a pixel, one thread
+SECONDS_A_PIXEL = {"tracks": 1e-6, "guided": 1.3e-6, "lift": 8e-7, "deform": 3e-7}  # seconds a pixel, one thread
 # Seconds of a step, one thread: for each pixel of a picture, and for each Gaussian.
 STEP_A_PIXEL, STEP_A_GAUSSIAN = 3e-7, 1e-6
 # As the worker has them (a test compares): longest side in pixels, steps and most Gaussians of a quality …
@@ -24,7 +24,7 @@ QUALITIES = {
     "FINE": (512, 4000, 100_000),
     "BEST": (1024, 15_000, 200_000),
 }
-MOST_STEPS = {"guided": 3000, "lift": 3000, "rgb": 1500}  # … and the steps beyond which a method gains nothing
+MOST_STEPS = {"guided": 3000, "lift": 3000}  # … and the steps beyond which a method gains nothing
 TRACK_STEPS = (600, 25)  # of tracks: so many, or so many a picture if that is more
 _seconds_a_sample = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
 
@@ -49,6 +49,8 @@ def estimate(settings, context) -> Estimate:
     fit, most = settings.refine, predicted
     if settings.method == "tracks":
         predicted = most = min(max(predicted, TRACKED[0]), TRACKED[1])
+    elif settings.method == "deform":
+        most = predicted
     else:
         if settings.budget != "ALL":
             fit = fit or FIT_SECONDS * max(settings.size**2 / USUAL_PIXELS, 1)
@@ -70,7 +72,7 @@ def _fit_seconds(settings, pictures: int, gaussians: float) -> float:
     """Of the steps of a quality with so many Gaussians."""
     size, steps, _ = QUALITIES[settings.quality]
     least, each = TRACK_STEPS
-    most = max(least, each * pictures) if settings.method == "tracks" else MOST_STEPS[settings.method]
+    most = max(least, each * pictures) if settings.method == "tracks" else MOST_STEPS.get(settings.method, steps)
     size = settings.size / -(-settings.size // size)  # averaged down by a whole factor
     return min(steps, most) * (size**2 * STEP_A_PIXEL + gaussians * STEP_A_GAUSSIAN)
 
@@ -87,6 +89,6 @@ def learn_number(method: str, gaussians: int, pictures: int, size: int) -> None:
 
 
 def _pixels_that_count(method: str, pictures: int, size: int) -> int:
-    """The pixels that the number of Gaussians goes by: those of all pictures, but of one for tracks, which are points
-    of the surface and lie as densely as its pixels."""
-    return size**2 * (1 if method == "tracks" else pictures)
+    """The pixels that the number of Gaussians goes by: those of all pictures, but of one for tracks and what
+    comes to be tracks, which lie on the surface as densely as its pixels."""
+    return size**2 * (1 if method in ("tracks", "deform") else pictures)

@@ -21,7 +21,11 @@ METHODS = [
     ),
     ("guided", "Guided", "The network, led by depth and motion that Blender renders along"),
     ("lift", "Lift", "Depth and motion straight to Gaussians, without a network: fastest"),
-    ("rgb", "Pictures Only", "The network from colour alone, as it would be for photographs"),
+    (
+        "deform",
+        "Pictures Only",
+        "One cloud and its motion, fitted to colour alone, as to photographs: for what has no surface",
+    ),
 ]
 QUALITIES = [  # what they mean is the worker's (model/fitting/quality.py): steps, not seconds
     ("DRAFT", "Draft", "A few steps, at most 10,000 Gaussians: for pictures of 128 pixels"),

@@ -113,7 +113,7 @@ def run_deform(views: Views, options: ReconstructOptions, progress: Progress | N
     from .deformation.fit import reconstruct_deform
 
     seconds = options.refine or options.seconds
-    told = {"budget": options.budget, "seed": options.seed, "progress": progress}
+    told = {"budget": options.budget, "max_loss": options.max_loss, "seed": options.seed, "progress": progress}
     return reconstruct_deform(views, seconds, steps=options.steps, quality=options.named_quality, **told)
 
 

@@ -110,7 +110,7 @@ def _reconstruct(request: dict, progress) -> dict:
 
     refine, budget, checkpoint = request.get("refine", 0.0), request.get("budget"), request.get("checkpoint")
     quality = request.get("quality")
-    if not (refine or budget or quality) and request.get("method", "tracks") != "tracks":
+    if not (refine or budget or quality) and request.get("method", "tracks") not in ("tracks", "deform"):
         # A third of torch's start-up: what shapes its operations return, for compilers. What fits uses
         # torch.optim, which loads them; so do tracks' random numbers.
         sys.modules.setdefault("torch._meta_registrations", ModuleType("torch._meta_registrations"))
@@ -119,6 +119,8 @@ def _reconstruct(request: dict, progress) -> dict:
     from .reconstruct import ReconstructOptions, chosen_method, reconstruct, untracked_note  # imports torch
 
     method = chosen_method(sequence, request.get("method"), indices)
+    if not (refine or quality):
+        quality = method_named(method).quality
     options = ReconstructOptions(
         device=request.get("device", "cpu"),
         checkpoint=Path(checkpoint) if checkpoint else None,

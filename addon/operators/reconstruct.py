@@ -72,7 +72,7 @@ def request(chosen, context) -> dict:
         "in_turn": chosen.in_turn,
         "size": chosen.size,
         "samples": chosen.samples,
-        "passes": getattr(chosen, "method", "") != "rgb",
+        "passes": getattr(chosen, "method", "") != "deform",
         "tracks": getattr(chosen, "method", "") in ("", "tracks"),
         "lighting": chosen.lighting,
     }
@@ -113,7 +113,9 @@ def start(chosen, context) -> jobs.Job:
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
         method = event.get("method", asked["method"])
-        fitted = asked["quality"] or (asked["refine"] and method != "tracks")  # a fit of tracks keeps nearly all
+        fitted = asked["quality"] or (
+            asked["refine"] and method not in ("tracks", "deform")
+        )  # a fit of tracks keeps nearly all
         if not (asked["budget"] or fitted):  # else their number is not the pixels' alone
             estimates.learn_number(method, len(asset), expected.pictures, size)
         ob = add_asset(asset, "Timesplat", look=look, context=bpy.context)

@@ -16,19 +16,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...datagen.sequence import InputError
 from ..fitting.budget import parse_budget
 from ..fitting.densify import Densifier, Pace
 from ..fitting.fit_views import detached, reduction
 from ..fitting.loop import Pyramid, Schedule, Step, gradients, optimise, photometric_loss, warm_up
 from ..fitting.parameters import Parameters
 from ..fitting.quality import Quality
+from ..fitting.refine import part
 from ..geometry.silhouettes import points_inside
 from ..geometry.surface_tracks import pixel_size
 from ..tracks import Tracks4D
 from ..views import Views
 from .cloud import SEEN, ControlPoints, DeformingCloud
 from .motion_table import SEVERAL, SHARP, MotionTable
+from .thin import thinned
 
 LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
@@ -203,19 +204,20 @@ def reconstruct_deform(
     steps: int | None = None,
     quality: Quality | None = None,
     budget: str | None = None,
+    max_loss: float = 0.1,
     seed: int = 0,
     progress=None,
 ) -> Tracks4D:
     """Views (RGB and alpha alone are used) -> tracks (N,), after about `seconds`, or exactly `steps`, or those of
-    `quality`, and no more than these, than the budget and than PER_PIXEL say. budget: "N", or "P%" of the most that
-    there would be without. For `progress` see `optimise`. Raises InputError for the budget "auto"."""
+    `quality`, and no more than these, than the budget and than PER_PIXEL say. budget: "N", "P%" of the most that
+    there would be without, or "auto" for as few as lose no more than `max_loss` dB (`thin.py`). For `progress` see
+    `optimise`."""
     if quality:
         steps = quality.steps
     most = min(quality.gaussians if quality else MAX_GAUSSIANS, worth(views))
-    if budget:
-        wanted = parse_budget(budget)
-        if wanted is None:
-            raise InputError("deform: its budget cannot be found by itself; give a number of Gaussians.")
+    wanted = parse_budget(budget) if budget else None
+    fewest = bool(budget) and wanted is None
+    if wanted is not None:
         most = max(round(wanted * most), 1) if isinstance(wanted, float) else wanted
     with gradients():
         views = detached(views)
@@ -233,9 +235,11 @@ def reconstruct_deform(
             after_backward=state.after_backward,
             generator=state.generator,
             text="fitting motion and looks",
-            progress=progress,
+            progress=part(progress, 0, 0.6 if fewest else 1),
         )
         state._bind()
         frames = round(2 / views.frame_step) + 1
         tracks = state.cloud().to_tracks(frames, TOLERANCE * state.pixel)
+        if fewest:
+            return thinned(tracks, views, max_loss, part(progress, 0.6, 1))
         return tracks if len(tracks) <= most else tracks[tracks.opacity.topk(most).indices]

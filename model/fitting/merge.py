@@ -16,6 +16,7 @@ from torch import Tensor
 from ..gaussians import Gaussians4D
 from ..rasterize import render
 from ..rotations import scale_rotation_from_covariance
+from ..tracks import Tracks4D
 from ..views import Views
 from .loop import gradients
 
@@ -23,13 +24,15 @@ MOMENTS = 6  # parts of the clip within which what moves is merged
 HALVINGS = 16  # of the interval in which the cells' side is looked for
 
 
-def contribution(g: Gaussians4D, views: Views) -> Tensor:
+def contribution(g: Gaussians4D | Tracks4D, views: Views) -> Tensor:
     """(N,) the sum over all pixels of `views` of the weight with which each Gaussian is blended there: what is
     hidden from them all, or lives at other times, has 0. It is the gradient of the pictures' sum by the colour."""
     height, width = views.size
     with gradients():
         rgb = torch.zeros_like(g.rgb).requires_grad_()
-        here = replace(g, rgb=rgb).map(torch.clone)
+        here = replace(g, rgb=rgb)
+        if isinstance(here, Gaussians4D):
+            here = here.map(torch.clone)
         picture, _ = render(here, views.c2w, views.intrinsics, views.time, width, height, background=0.0)
         (grad,) = torch.autograd.grad(picture[..., 0].sum(), rgb)
     return grad[:, 0]

@@ -5,7 +5,7 @@ from dataclasses import astuple
 
 from timesplat.model.fitting.fit_tracks import FIT
 from timesplat.model.fitting.quality import QUALITIES
-from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB
+from timesplat.model.fitting.refine import FROM_DEPTH
 from timesplat.model.methods import METHODS
 
 PRESETS = """
@@ -15,7 +15,7 @@ reconstruct = part("addon.operators.reconstruct")
 chosen = bpy.context.scene.timesplat
 default, told, followed = [chosen.method, settings.fit(chosen)], {}, {}
 for key, *_ in presets.PRESET_ITEMS:
-    chosen.method, chosen.budget = "rgb", "NUMBER"
+    chosen.method, chosen.budget = "deform", "NUMBER"
     bpy.ops.timesplat.preset(preset=key)
     e = estimates.estimate(chosen, bpy.context)
     same = [getattr(chosen, k) == v for k, v in presets.PRESETS[key].items()]
@@ -43,7 +43,7 @@ def test_the_presets(blender):
         assert same == [True, "tracks", "ALL"] and fit == {"quality": name, "refine": 0.0}
         assert size == quality.size and gaussians <= quality.gaussians
     assert told["followed"] == {
-        "tracks": [True, True], "guided": [False, True], "lift": [False, True], "rgb": [False, False],
+        "tracks": [True, True], "guided": [False, True], "lift": [False, True], "deform": [False, False],
     }  # fmt: skip
     assert set(told["followed"]) <= set(METHODS)
 
@@ -51,5 +51,5 @@ def test_the_presets(blender):
 def test_estimates_know_what_the_worker_does(blender):
     told = blender(PRESETS)
     assert {k.lower(): tuple(v) for k, v in told["qualities"].items()} == {k: astuple(q) for k, q in QUALITIES.items()}
-    assert told["most"] == {"guided": FROM_DEPTH.max_steps, "lift": FROM_DEPTH.max_steps, "rgb": FROM_RGB.max_steps}
+    assert told["most"] == {"guided": FROM_DEPTH.max_steps, "lift": FROM_DEPTH.max_steps}
     assert told["tracks"] == [FIT.least_steps, FIT.steps_a_view]

@@ -54,7 +54,7 @@ scene.collection.objects.link(camera)
 camera.location, camera.rotation_euler = (2, -1, 3), (np.pi / 2, 0, 0)
 bpy.ops.object.select_all(action="DESELECT")
 camera.select_set(True)
-second = bpy.ops.timesplat.reconstruct(method="rgb", every=5, size=32, samples=2, budget="NUMBER", number=50,
+second = bpy.ops.timesplat.reconstruct(method="deform", every=5, size=32, samples=2, budget="NUMBER", number=50,
                                        refine=0.5)
 count = len(bpy.context.object.data.points if hasattr(bpy.context.object.data, "points") else
             bpy.context.object.data.vertices)

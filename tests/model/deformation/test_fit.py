@@ -81,7 +81,14 @@ def test_pictures_double_from_about_128_pixels_to_their_own_size():
     assert [size for _, size in pyramid_of(1024)] == [128, 256, 512] == [size for _, size in pyramid_of(1023)]
 
 
-def test_a_budget_of_one_and_one_that_cannot_be_found():
+def test_a_budget_of_one():
     assert len(reconstruct_deform(seen(0), steps=2, budget="1")) == 1
-    with pytest.raises(InputError, match="give a number"):
-        reconstruct_deform(seen(0), steps=1, budget="auto")
+
+
+def test_auto_keeps_what_the_scene_needs():
+    views = seen(0)
+    every, few = (reconstruct_deform(views, steps=120, budget=b, max_loss=1.0) for b in (None, "auto"))
+    assert len(few) < len(every) / 2
+    assert psnr(few, seen(60)) > psnr(every, seen(60)) - 1.5
+    with pytest.raises(InputError, match="give more than 0"):
+        reconstruct_deform(views, steps=1, budget="auto", max_loss=0.0)

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""No more Gaussians than a scene needs, out of a fit that has as many as its pixels are worth: halved, those that show
+least first, for as long as the views that are left out of it do not tell."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from ...datagen.sequence import InputError
+from ..fitting.budget import HELD_OUT
+from ..fitting.fit_tracks import fit_tracks
+from ..fitting.fit_views import squared_error, validation_views
+from ..fitting.loop import Schedule
+from ..fitting.merge import contribution
+from ..fitting.refine import part
+from ..geometry.surface_tracks import pixel_size
+from ..tracks import Tracks4D
+from ..views import Views
+
+STEPS = 150  # of the looks of what is left, each time
+LOOKED_AT = 24  # views, at the most, by which it is known how much each shows
+FEWEST = 8
+
+
+def thinned(tracks: Tracks4D, views: Views, max_loss: float, progress=None) -> Tracks4D:
+    """The tracks (N,) of a fit to detached views -> as few of them as keep within `max_loss` dB of all, their looks
+    fitted anew; to be called inside of `gradients()`. For `progress` see `optimise`. Raises InputError for a loss not
+    above 0."""
+    if not max_loss > 0:
+        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
+    held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
+    kept = [i for i in range(len(views)) if i not in held_out] or held_out
+    fitted, unseen, pixel = views[kept], views[held_out], pixel_size(views)
+    some = fitted[validation_views(fitted, min(LOOKED_AT, len(fitted)))]
+
+    def fit(start: Tracks4D, tried: int) -> tuple[Tracks4D, float]:
+        told = part(progress, 1 - 0.7**tried, 1 - 0.7 ** (tried + 1))
+        done = fit_tracks(start, fitted, Schedule(steps=STEPS, pyramid=()), pixel=pixel, progress=told)
+        return done, -10 * math.log10(max(squared_error(done, unseen), 1e-10))
+
+    best, enough = tracks, None
+    for tried in range(64):
+        fewer = best
+        if tried:
+            most = contribution(best, some).topk(len(best) // 2).indices
+            fewer = best[most]
+            # Each stands for what was two: on a surface, as wide as both together.
+            fewer = replace(fewer, scale=fewer.scale * math.sqrt(2))
+        done, quality = fit(fewer, tried)
+        enough = quality - max_loss if enough is None else enough
+        if quality < enough or (tried and len(done) < FEWEST):
+            return best
+        best = done
+    return best
