@@ -428,6 +428,22 @@ def bench(args: argparse.Namespace) -> int:
     return bench(options_of(BenchOptions, args))
 
 
+def stress_arguments(p: argparse.ArgumentParser) -> None:
+    from .evaluation.stress.command import add_arguments
+
+    add_arguments(p)
+
+
+def stress(args: argparse.Namespace) -> int:
+    """Where methods fail: procedural scenes and inputs whose difficulty is one number each, swept from easy to
+    impossible, with worst frames, ghosts, flicker and times that no input shows. Writes one page of charts and
+    pictures, a table and figures into --out. Other people's methods: --scenes writes what they see, --score scores
+    their pictures."""
+    from .evaluation.stress.command import StressOptions, stress
+
+    return stress(options_of(StressOptions, args))
+
+
 def demo_arguments(p: argparse.ArgumentParser) -> None:
     from .evaluation.demo import add_arguments
 
@@ -473,6 +489,7 @@ COMMANDS = {
     "view": (view_arguments, view, "play an asset in the browser"),
     "evaluate": (evaluate_arguments, evaluate, "score methods on held-out views"),
     "bench": (bench_arguments, bench, "speed against accuracy, in charts"),
+    "stress": (stress_arguments, stress, "where methods fail, in charts"),
     "train": (train_arguments, train, "train a network on Sequences"),
     "extension": (extension_arguments, extension, "build the Blender extension"),
 }

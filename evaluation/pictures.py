@@ -13,7 +13,8 @@ MARGIN = 4
 LABEL = 96
 
 
-def _bytes(image: torch.Tensor) -> np.ndarray:
+def as_bytes(image: torch.Tensor) -> np.ndarray:
+    """(…,3) 0..1 -> uint8."""
     return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
 
 
@@ -29,7 +30,7 @@ def grid(rows: dict[str, torch.Tensor], columns: list[str]) -> Image.Image:
         y = 20 + j * (height + MARGIN)
         pen.text((4, y + height // 2 - 8), label, fill="black", font=font)
         for i in range(n):
-            sheet.paste(Image.fromarray(_bytes(images[i])), (LABEL + i * (width + MARGIN), y))
+            sheet.paste(Image.fromarray(as_bytes(images[i])), (LABEL + i * (width + MARGIN), y))
     return sheet
 
 
@@ -38,7 +39,7 @@ def video(path: Path, rows: dict[str, torch.Tensor], fps: float) -> None:
     font = ImageFont.load_default(13)
     frames = []
     for i in range(len(next(iter(rows.values())))):
-        strip = np.concatenate([_bytes(images[i]) for images in rows.values()], 1)
+        strip = np.concatenate([as_bytes(images[i]) for images in rows.values()], 1)
         frame = Image.new("RGB", (strip.shape[1], strip.shape[0] + 18), "white")
         frame.paste(Image.fromarray(strip), (0, 18))
         pen = ImageDraw.Draw(frame)

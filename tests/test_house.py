@@ -51,7 +51,7 @@ LAYERS = {
             "evaluation.differences",
         ),
         ("evaluation.study_scores",),
-        ("evaluation.studies", "evaluation.contact_sheet", "evaluation.inspection_picture"),
+        ("evaluation.studies", "evaluation.contact_sheet", "evaluation.inspection_picture", "evaluation.stress"),
     ),
     "addon": (
         ("addon.asset",),
@@ -72,7 +72,7 @@ LAYERS = {
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.render_setup", "datagen.tracks"),
         ("datagen.capture",),
-        ("datagen.render_asset", "datagen.farm"),
+        ("datagen.render_asset", "datagen.render_trials", "datagen.farm"),
     ),
     "benchmarks": (
         ("benchmarks.timing", "benchmarks.cameras", "benchmarks.opensplat"),

@@ -17,9 +17,10 @@ import bpy
 import numpy as np
 
 from .floaters import flyer, monster, swimmer
-from .puppet import FRAMES, TAU, Paint, Puppet
+from .puppet import FRAMES, TAU, Paint, Part, Puppet
 from .shapes import apply, rotation, translation
 from .things import machine, morph, plant, stack, vehicle
+from .trials import STEPS, TRIALS, VERSION
 from .walkers import humanoid, walker
 
 FIRST_EVALUATION_SEED = 1_000_000
@@ -47,11 +48,8 @@ def build_object(seed: int) -> dict:
     family, motions, the parts' names with their number, vertices, frames, and whether it is still."""
     puppet, family = _design(seed)
     parts = puppet.finish()
-    _add_mesh(f"zoo_{seed}", parts, puppet)
-    scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = 1, FRAMES
-    scene.render.fps, scene.render.fps_base = FRAMES_PER_SECOND, 1.0
-    scene.frame_set(1)
+    _add_mesh(f"zoo_{seed}", parts, puppet.paints)
+    _set_frames(FRAMES)
     names = [part.name for part in parts]
     return {
         "generator": "timesplat.datagen.zoo",  # a name that data sets bear, whatever this file is called
@@ -63,6 +61,22 @@ def build_object(seed: int) -> dict:
         "frames": [1, FRAMES],
         "static": puppet.still,
     }
+
+
+def build_trial(name: str, level: float) -> dict:
+    """Build a trial of `TRIALS` at a level into the current scene, which should be empty, from frame 1 on, a step a
+    frame. Returns what it is, for provenance."""
+    trial = TRIALS[name](level)
+    _add_mesh(f"trial_{name}", trial.parts, trial.paints)
+    _set_frames(STEPS)
+    return {"trial": name, "level": level, "version": VERSION}
+
+
+def _set_frames(count: int) -> None:
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, count
+    scene.render.fps, scene.render.fps_base = FRAMES_PER_SECOND, 1.0
+    scene.frame_set(1)
 
 
 def _design(seed: int) -> tuple[Puppet, str]:
@@ -106,7 +120,7 @@ def _roam(p: Puppet, rooted: bool):
     p.warps.append(lambda points: apply(heading @ centre @ motion @ np.linalg.inv(centre), points))
 
 
-def _add_mesh(name: str, parts: list, puppet: Puppet):
+def _add_mesh(name: str, parts: list[Part], paints: dict[str, Paint]):
     """One mesh object with a shape key a frame, played by its evaluation time."""
     starts = np.cumsum([0] + [len(part.rest) for part in parts])
     rest = np.concatenate([part.rest for part in parts])
@@ -115,7 +129,7 @@ def _add_mesh(name: str, parts: list, puppet: Puppet):
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(frames[0], [], faces)
     used = list(dict.fromkeys(part.paint for part in parts))
-    low, high = puppet.bounds()
+    low, high = rest.min(0), rest.max(0)
     # Pattern coordinates: the rest pose in a box of length 1 around the origin, whatever its size.
     coordinates = ((rest - (low + high) / 2) / (high - low).max()).astype(np.float32)
     mesh.attributes.new("rest", "FLOAT_VECTOR", "POINT").data.foreach_set("vector", coordinates.ravel())
@@ -124,14 +138,14 @@ def _add_mesh(name: str, parts: list, puppet: Puppet):
     mesh.polygons.foreach_set("material_index", slots.astype(np.int32))
     mesh.polygons.foreach_set("use_smooth", ~np.repeat([part.flat for part in parts], counts))
     for key in used:
-        mesh.materials.append(_new_material(f"{name}_{key}", puppet.paints[key]))
+        mesh.materials.append(_new_material(f"{name}_{key}", paints[key]))
     thing = bpy.data.objects.new(name, mesh)
     bpy.context.scene.collection.objects.link(thing)
     for points in frames:
         thing.shape_key_add(name="frame", from_mix=False).points.foreach_set("co", points.ravel())
     keys = mesh.shape_keys
     keys.use_relative = False
-    for frame in (1, FRAMES):
+    for frame in (1, len(frames)):
         keys.eval_time = keys.key_blocks[frame - 1].frame
         keys.keyframe_insert("eval_time", frame=frame)
     _play_evenly(keys.animation_data)
@@ -155,6 +169,7 @@ def _new_material(name: str, paint: Paint):
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Roughness"].default_value = paint.roughness
     shader.inputs["Metallic"].default_value = paint.metallic
+    shader.inputs["Alpha"].default_value = paint.alpha
     colours = [(*_linear_rgb(c), 1.0) for c in paint.colours]
     material.diffuse_color = shader.inputs["Base Color"].default_value = colours[0]
     if paint.pattern == "flat":

@@ -29,6 +29,7 @@ class Paint:
     axis: int = 1
     roughness: float = 0.7
     metallic: float = 0.0
+    alpha: float = 1.0  # 0: seen through
 
 
 @dataclass
