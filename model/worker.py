@@ -35,7 +35,6 @@ Whatever a library prints goes to standard error, so that the answers stay whole
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -147,24 +146,13 @@ def _reconstruct(request: dict, progress) -> dict:
     return {"asset": request["asset"], "gaussians": len(gaussians), "method": method, "note": note}
 
 
-def _limit_memory() -> None:
-    """To half of the machine's, on Linux: a damaged USD file may claim to need any amount. (Windows has no such limit,
-    and on macOS an address space is larger than any memory from the start.)"""
-    if sys.platform != "linux":
-        return
-    with contextlib.suppress(OSError, ValueError):
-        import resource
-
-        half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-        resource.setrlimit(resource.RLIMIT_AS, (half, resource.getrlimit(resource.RLIMIT_AS)[1]))
-
-
 def _export(request: dict, progress) -> dict:
-    _limit_memory()
     from .io.ply import read_ply
+    from .io.usd_apart import limit_memory
     from .io.usd_check import check_usd
     from .io.usd_write import write_usd
 
+    limit_memory()
     out = Path(request["out"])
     progress(0.0, "reading the asset")
     asset = read_ply(request["asset"])
@@ -189,10 +177,11 @@ def _matrices(path: str) -> np.ndarray:
 
 
 def _import(request: dict, progress) -> dict:
-    _limit_memory()
     from .io.ply import write_ply
+    from .io.usd_apart import limit_memory
     from .io.usd_read import load_usd
 
+    limit_memory()
     progress(0.0, f"reading {Path(request['source']).name}")
     loaded = load_usd(request["source"])
     progress(0.7, "writing the asset")

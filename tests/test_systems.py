@@ -19,8 +19,7 @@ from timesplat.datagen import render_asset, sequence
 from timesplat.datagen.farm import render_assets
 from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.sequence import InputError, move, read_sequence
-from timesplat.model import worker
-from timesplat.model.io import atomic
+from timesplat.model.io import atomic, usd_apart
 from timesplat.model.io.ply import write_ply
 
 from .assets import make_asset
@@ -238,7 +237,6 @@ def test_what_the_worker_starts_does_not_wait_for_its_input():
     """On Windows a program hangs at its start while the pipe that it inherits is read; so it inherits nothing."""
     code = """
 import subprocess, sys
-from timesplat.model import worker
 def task(request, progress):
     said = subprocess.run([sys.executable, "-c", "print(len(input() or 'x'))"], capture_output=True, text=True).stderr
     return {"report": [said.strip().splitlines()[-1]]}
@@ -272,7 +270,7 @@ def test_only_linux_limits_the_address_space(monkeypatch):
     monkeypatch.setattr(resource, "setrlimit", lambda *limits: asked.append(limits))
     for platform in ("darwin", "win32", "linux"):
         monkeypatch.setattr(sys, "platform", platform)
-        worker._limit_memory()
+        usd_apart.limit_memory()
     assert len(asked) == 1
 
 

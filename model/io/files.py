@@ -5,6 +5,7 @@ No torch, and pxr only when a USD file is read or written, so that it runs insid
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -19,16 +20,24 @@ from .placement import place_asset
 from .ply import write_ply
 from .slices import write_slice
 from .splat_files import read_any_ply, read_splat, read_spz
+from .usd_apart import load_usd_apart
 from .usd_read import load_usd
 from .usd_stage import USD_SUFFIXES
 from .usd_write import write_usd
+
+
+def _read_usd(path: Path) -> LoadedAsset:
+    """In a process of its own, for the library dies over some damaged files. In Blender, where there may be no other
+    Python that has it, here: its importer asks the worker first."""
+    return load_usd(path) if "bpy" in sys.modules else load_usd_apart(path)
+
 
 READERS: dict[str, Callable[[Path], LoadedAsset]] = {
     ".ply": read_any_ply,
     ".splat": read_splat,
     ".spz": read_spz,
     ".html": read_page,
-    **dict.fromkeys(USD_SUFFIXES, load_usd),
+    **dict.fromkeys(USD_SUFFIXES, _read_usd),
 }
 WRITERS: dict[str, Callable[..., None]] = {
     ".ply": write_ply,
