@@ -20,6 +20,8 @@ ONE_FRAME_SIGMA = 1 / 3  # σ_t, in frames, of what shows at one frame: 1.1 % of
 SCREEN_BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
 SMALLEST_SCALE = 1e-9  # other programs' splats are at least so large
 FAR = 256  # times its size (or units, what is smaller than one) away from the origin, float32 costs 1e-5 of that
+BRIGHTEST = 1e6  # colours beyond are damage; as coefficients they would be infinite
+FARTHEST_KNOT = 1e15  # of a path, from the origin: what rides on it is turned, and squares must stay finite
 MAX_GAUSSIANS = 10_000_000  # that a compressed file or a sequence may hold, as in Niantic's reader
 MAX_CLIP_FRAMES = 50_000  # more than half an hour
 MAX_FRAME_NUMBER = 1 << 20  # as far as Blender counts
@@ -128,7 +130,8 @@ class Asset:
         """(N,3) standard deviations as they looked in the pictures that the asset was fitted to, where the
         rasteriser blurred by SCREEN_BLUR px². Renderers which do not, or at a higher resolution, show holes
         between Gaussians with the plain `scale`. Equal to it where clip.pixel is 0."""
-        return np.sqrt(self.scale**2 + np.float32(SCREEN_BLUR * self.clip.pixel**2))
+        # not by squares, which are 0 or infinite long before their roots are
+        return np.hypot(self.scale, np.float32(SCREEN_BLUR**0.5 * self.clip.pixel))
 
     def softened(self) -> Asset:
         """The same with `soft_scale` for good (clip.pixel 0), for viewers that know nothing of pixels."""
@@ -194,7 +197,7 @@ def sound_part(asset: Asset, source: str | Path) -> tuple[Asset, str]:
     n, notes = len(asset), []
     if n == 0 or any(len(getattr(asset, k)) != n for k in ARRAYS):
         check(asset, source)
-    bad = {k: ~np.isfinite(getattr(asset, k)).reshape(n, -1).all(1) for k in ARRAYS}
+    bad = {k: ~_in_bounds(asset, k) for k in ARRAYS}
     named = " and ".join(_WORDS.get(k, k) for k, rows in bad.items() if rows.any())
     lost = np.logical_or.reduce(list(bad.values()))
     if n and lost.all():
@@ -207,6 +210,13 @@ def sound_part(asset: Asset, source: str | Path) -> tuple[Asset, str]:
     asset = replace(asset, opacity=np.clip(asset.opacity, 0, 1))
     check(asset, source)
     return asset, " ".join(notes)
+
+
+def _in_bounds(asset: Asset, name: str) -> np.ndarray:
+    """(N,) bool: where an array holds no NaN, no infinity, and no colour beyond BRIGHTEST."""
+    with np.errstate(invalid="ignore"):
+        found = np.abs(getattr(asset, name)) <= (BRIGHTEST if name == "rgb" else np.finfo(np.float32).max)
+    return found.reshape(len(asset), -1).all(1)
 
 
 def check(asset: Asset, source: str | Path = "the asset") -> None:
@@ -227,6 +237,8 @@ def check(asset: Asset, source: str | Path = "the asset") -> None:
         finite = np.isfinite(a).reshape(n, -1).all(1)
         if not finite.all():
             raise bad(f"{name} holds NaN or infinity ({(~finite).sum()} of {n} Gaussians)")
+    if not (bright := _in_bounds(asset, "rgb")).all():
+        raise bad(f"rgb holds colours beyond all bounds ({(~bright).sum()} of {n} Gaussians)")
     for name in ("sigma_t", "scale"):
         if not (getattr(asset, name) > 0).all():
             raise bad(f"{name} holds values that are not positive")
@@ -258,6 +270,8 @@ def _check_paths(p: Paths, path: np.ndarray | None, n: int, bad: Callable[[str],
         raise bad(f"it has more than {MAX_GAUSSIANS:,} paths")
     if not ((p.count >= 1).all() and (p.start < p.end).all()):
         raise bad("it has paths without knots, or that end before they start")
+    if np.abs(p.place).max() > FARTHEST_KNOT:
+        raise bad("its paths lead beyond all bounds")
     if np.abs(np.linalg.norm(p.rotation.astype(np.float64), axis=1) - 1).max() > 1e-3:
         raise bad("its paths hold quaternions that are not of unit length")
     if path is None or path.shape != (n,) or path.min() < 0 or path.max() >= len(p):

@@ -53,8 +53,8 @@ def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIB
     encode = SLICE_FORMATS.get(path.suffix.lower())
     if encode is None:
         raise InputError(f"{path}: the name of a slice must end in {', '.join(SLICE_FORMATS)}; choose one of these.")
-    part = slice_at(asset, frame, cut)
     try:
+        part = slice_at(asset, frame, cut)
         data = encode(part, frame)
     except InputError as e:
         raise InputError(f"{path}: {e}") from None

@@ -87,6 +87,34 @@ def test_check_knows_what_a_clip_can_be(clip, words):
         check(make_asset(5, clip=clip))
 
 
+def test_a_path_that_leads_beyond_all_bounds_is_refused():
+    """Its numbers are finite; places on it would be NaN."""
+    asset = tracked_asset(8)
+    asset.paths.place[1] = 3e38
+    with pytest.raises(InputError, match="beyond all bounds"):
+        check(asset)
+
+
+def test_soft_scales_of_any_size():
+    """Squares of numbers that small are 0, of numbers that large infinite."""
+    for size in (1e-38, 1e-25, 1e25, 3e38):
+        asset = make_asset(2, clip=Clip(pixel=0.0))
+        asset.scale[:] = size
+        assert np.array_equal(asset.soft_scale(), asset.scale)
+    asset = make_asset(2, clip=Clip(pixel=0.01))
+    asset.scale[:] = 1e-30
+    assert np.allclose(asset.soft_scale(), np.sqrt(0.3) * 0.01)
+
+
+def test_a_colour_beyond_all_bounds_is_damage():
+    asset = make_asset(5)
+    asset.rgb[2, 1] = 3e38
+    with pytest.raises(InputError, match=r"rgb holds colours beyond all bounds \(1 of 5"):
+        check(asset)
+    sound, note = sound_part(asset, "a.ply")
+    assert len(sound) == 4 and "1 of 5 Gaussians are left out" in note
+
+
 def test_a_static_asset_is_the_same_at_all_times():
     still = static_asset(
         "it", np.ones((2, 3)), np.ones((2, 3)), [[2, 0, 0, 0], [0, 0, 0, 0]], np.ones((2, 3)), [0.5, 1]

@@ -102,3 +102,12 @@ def test_slices_come_whole_or_not_at_all(tmp_path, monkeypatch):
         write_slice(tmp_path / "a.obj", asset, 5)
     with pytest.raises(InputError, match="NaN"):
         write_slice(tmp_path / "a.ply", replace(asset, xyz=asset.xyz * np.float32("nan")), 5)
+
+
+def test_a_sentence_about_a_slice_names_its_file(tmp_path):
+    """At that frame it is so large that it is infinite in the world's units."""
+    asset = make_asset(4)
+    asset.scale[:], asset.sigma_t[:], asset.opacity[:] = 3e38, 1e3, 1
+    with pytest.raises(InputError, match=rf"^{tmp_path}/a.splat: the slice: scale holds NaN or infinity"):
+        write_slice(tmp_path / "a.splat", asset, 20)
+    assert not (tmp_path / "a.splat").exists()
