@@ -13,6 +13,7 @@ import math
 import re
 import struct
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
@@ -82,6 +83,7 @@ def capture(
     settings: CaptureSettings | None = None,
     *,
     provenance: dict | None = None,
+    started: float | None = None,
     refuse_empty: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Sequence:
@@ -89,6 +91,7 @@ def capture(
 
     shots           cameras in normalised space; `Shot.frame` counts the clip's frames, 0…len(subject.frames)-1
     provenance      what the Sequence says of where it came from
+    started         when work on it began, by time.monotonic(): the provenance says how many seconds ago; None = now
     refuse_empty    pictures of which none shows anything are an InputError
     progress        called with (images done, images in all) after every frame
 
@@ -97,7 +100,7 @@ def capture(
     Raises InputError where there is nothing to render. Values that an artist changed without keying them
     are lost, as after every animation render in Blender; everything else is as before.
     """
-    settings = settings or CaptureSettings()
+    settings, started = settings or CaptureSettings(), time.monotonic() if started is None else started
     if not shots:
         raise InputError(f"{out}: there is no camera to render; choose a rig and at least one frame.")
     names = _file_names(shots)
@@ -132,6 +135,7 @@ def capture(
                     f"{out}: no picture shows anything, for what is there is transparent or out of sight; look at its "
                     "materials and visibility."
                 )
+        seq.provenance["seconds"] = round(time.monotonic() - started, 2)
 
     return write_sequence(seq, out, fill)
 

@@ -1,29 +1,44 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Many assets to Sequences: `timesplat render`.
 
-Each asset is opened and rendered in a child process of its own (`render_asset`, run with a job file), so that one
-that crashes Blender or eats the memory never takes the others with it. The child writes its messages as JSON
-lines; what Blender prints goes to a log of which the last line is shown if it dies.
+Each asset is opened and rendered in a child process of its own (`render_child`), so that one that crashes Blender,
+never ends or eats the memory takes no other with it. What became of each stands in the run's table (`render_index`).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import contextlib
 import os
 import re
-import shutil
 import subprocess
 import sys
-import tempfile
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 
+from .. import __version__
 from . import ASSET_SUFFIXES
-from .render_job import ALL_CLIPS, CLIPS, Asset, RenderSettings, finished_sequences, list_assets
+from .licences import Licences, Terms, read_licences
+from .render_child import Limits, remove_half_written, run_child
+from .render_index import (
+    CRASHED,
+    CSV,
+    REFUSED,
+    Row,
+    failure_row,
+    forget_failure,
+    keep_failure,
+    kept_failure,
+    needed,
+    sequence_row,
+    set_terms,
+    write_index,
+)
+from .render_job import ALL_CLIPS, CLIPS, Asset, RenderSettings, file_sha256, list_assets, rendered_sequences
 from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
 
@@ -35,64 +50,131 @@ def render_assets(
     *,
     root: Path | None = None,
     jobs: int = 1,
+    limits: Limits | None = None,
+    licences: Licences | None = None,
+    retry: bool = True,
     report: Callable[[str], None] = print,
     progress: Callable[[int, int, int], None] = lambda done, total, images: None,
 ) -> tuple[list[Path], list[str]]:
-    """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<name>/<clip>`, `jobs` at a time. Names
-    are those of `list_assets`; below `root` (by default the folder given, or a file's own) paths in files may lead.
+    """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<name>/<clip>`, `jobs` at a time, and
+    writes the table of all of them (`render_index`). Names are those of `list_assets`; below `root` (by default the
+    folder given, or a file's own) paths in files may lead. An asset that goes beyond `limits` is given up; `licences`
+    go into the Sequences. retry False: what failed in an earlier run, under the same settings and limits, is not tried
+    again.
 
     Returns the folders of all Sequences, those found finished included, and one sentence for each asset that
     failed. `report` gets warnings and failures as they happen, `progress` assets done, in all, and images.
     """
+    needed()
     settings, out = settings or RenderSettings(), Path(out)
+    run = _Run(out, settings, limits or Limits(), licences or Licences())
     listed = list_assets(assets, root)
-    pending, folders, failures = _sort_out(listed, out, settings)
-    for sentence in failures:
+    pending = run.sort_out(listed, retry)
+    for sentence in run.failures:
         report(sentence)
     done, images = len(listed) - len(pending), 0
     progress(done, len(listed), images)
+    try:
+        with _Farm(run, max(1, min(jobs, len(pending)))) as farm:
+            for message in farm.render(pending):
+                if "warning" in message:
+                    report(message["warning"])
+                elif "image" in message:
+                    images += message["image"]
+                elif "end" in message:
+                    done += 1
+                    if sentence := run.finish(**message["end"]):
+                        report(sentence)
+                progress(done, len(listed), images)
+    finally:
+        write_index(out, run.rows)
+    return run.folders, run.failures
 
-    with _Farm(out, settings, max(1, min(jobs, len(pending)))) as farm:
-        for message in farm.render(pending):
-            if message is None:
-                done += 1
-            elif "written" in message:
-                folders.append(Path(message["written"]))
-            elif "image" in message:
-                images += message["image"]
-            elif "warning" in message:
-                report(message["warning"])
+
+@dataclass
+class _Run:
+    """What is asked for, and what is known of it so far."""
+
+    out: Path
+    settings: RenderSettings
+    limits: Limits
+    licences: Licences
+    rows: list[Row] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)  # sentences
+
+    def sort_out(self, assets: list[Asset], retry: bool) -> list[_Task]:
+        """What is still to render; what is finished, failed before, or would overwrite another asset is noted."""
+        pending, seen = [], {}
+        for asset in assets:
+            other = seen.setdefault(asset.name.lower(), asset)  # one folder for both on Windows and macOS
+            if other != asset:
+                remedy = "rename one of the two, or give a --root that holds both, for names are paths below it"
+                sentence = f"{asset.path}: it would be written over that of {other.path}; {remedy}."
+                self._note_failure(failure_row(asset, sentence, REFUSED))
+                continue
+            task = _Task(asset, sha256 := file_sha256(asset), self.licences.of(asset, sha256))
+            remove_half_written({"out": str(self.out / asset.name)})  # of a run that was killed
+            folders, whole = rendered_sequences(self.out / asset.name, asset, self.settings)
+            kept = None if retry else kept_failure(self.out, asset, sha256, self._conditions())
+            if whole or kept:
+                self._note_sequences(task, folders)
+                if not whole:
+                    self._note_failure(kept)
             else:
-                failures.append(message["error"])
-                report(message["error"])
-            progress(done, len(listed), images)
-    return folders, failures
+                pending.append(task)
+        return pending
+
+    def finish(self, task: _Task, written: list[str], error: dict | None, seconds: float) -> str | None:
+        """Notes what became of an asset; the sentence if it failed."""
+        self._note_sequences(task, [Path(folder) for folder in written])
+        if not error:
+            forget_failure(self.out, task.asset)
+            return None
+        row = failure_row(
+            task.asset, error["error"], error["status"], sha256=task.sha256, terms=task.terms, seconds=seconds
+        )
+        with contextlib.suppress(OSError):  # the disk is full, or a file has that folder's name: the table has it still
+            keep_failure(self.out, row, self._conditions())
+        self._note_failure(row)
+        return row.sentence
+
+    def job(self, task: _Task, own_cores: list[int]) -> dict:
+        """As `render_asset` takes it."""
+        job = {"asset": asdict(task.asset), "settings": asdict(self.settings), "terms": task.terms.as_provenance()}
+        return job | {"out": str(self.out / task.asset.name), "cores": own_cores}
+
+    def _conditions(self) -> dict:
+        return {"settings": asdict(self.settings), "limits": asdict(self.limits), "timesplat": __version__}
+
+    def _note_sequences(self, task: _Task, folders: list[Path]) -> None:
+        for folder in folders:
+            set_terms(folder, task.terms)
+            self.rows.append(sequence_row(self.out, folder, task.asset))
+            self.folders.append(folder)
+
+    def _note_failure(self, row: Row) -> None:
+        self.rows.append(row)
+        self.failures.append(row.sentence)
 
 
-def _sort_out(assets: list[Asset], out: Path, settings: RenderSettings) -> tuple[list[Asset], list[Path], list[str]]:
-    """Assets still to render, folders of Sequences that are finished, and a sentence for each asset that another one
-    of the same name would overwrite."""
-    pending, finished, failures, seen = [], [], [], {}
-    for asset in assets:
-        other = seen.setdefault(asset.name.lower(), asset)  # one folder for both on Windows and macOS
-        if other != asset:
-            remedy = "rename one of the two, or give a --root that holds both, for names are paths below it"
-            failures.append(f"{asset.path}: it would be written over that of {other.path}; {remedy}.")
-        elif folders := finished_sequences(out / asset.name, asset, settings):
-            finished += folders
-        else:
-            pending.append(asset)
-    return pending, finished, failures
+@dataclass(frozen=True)
+class _Task:
+    """An asset to render."""
+
+    asset: Asset
+    sha256: str
+    terms: Terms
 
 
 class _Farm:
     """Child processes, so many at a time. As a context: an exception inside kills those that run."""
 
-    def __init__(self, out: Path, settings: RenderSettings, jobs: int) -> None:
-        self.out, self.settings = out, settings
+    def __init__(self, run: _Run, jobs: int) -> None:
+        self.run = run
         self.pool = ThreadPoolExecutor(jobs)
         self.running: set[subprocess.Popen] = set()
-        self.messages: SimpleQueue[dict | None] = SimpleQueue()
+        self.messages: SimpleQueue[dict] = SimpleQueue()
         self.free_cores: SimpleQueue[list[int]] = SimpleQueue()
         for i in range(jobs):  # one core each: twice as efficient as threads that wait for each other
             self.free_cores.put([cores()[i % len(cores())]] if jobs > 1 else [])
@@ -107,26 +189,37 @@ class _Farm:
                 process.kill()
         self.pool.shutdown()
 
-    def render(self, assets: list[Asset]) -> Iterator[dict | None]:
-        """The messages of all children as they come (see `render_asset`); None once for each asset, its last."""
-        for asset in assets:
-            self.pool.submit(self._render_one, asset)
-        unfinished = len(assets)
+    def render(self, tasks: list[_Task]) -> Iterator[dict]:
+        """The messages of all children as they come (see `render_asset`), and {"end": …}, the arguments of
+        `_Run.finish`, once for each asset, its last."""
+        for task in tasks:
+            self.pool.submit(self._render_one, task)
+        unfinished = len(tasks)
         while unfinished:
             message = self.messages.get()
-            if message is None:
-                unfinished -= 1
+            unfinished -= "end" in message
             yield message
 
-    def _render_one(self, asset: Asset) -> None:
-        own_cores = self.free_cores.get()
-        out, settings = str(self.out / asset.name), asdict(self.settings)
+    def _render_one(self, task: _Task) -> None:
+        own_cores, start = self.free_cores.get(), time.monotonic()
+        written, errors = [], []
+
+        def receive(message: dict) -> None:
+            if "written" in message:
+                written.append(message["written"])
+            elif "error" in message:
+                errors.append(message)
+            else:
+                self.messages.put(message)
+
         try:
-            job = {"asset": asdict(asset), "out": out, "settings": settings, "cores": own_cores}
-            _run_child(job, self.messages.put, self.running)
+            run_child(self.run.job(task, own_cores), receive, self.running, self.run.limits)
+        except OSError as e:  # no process, no file could be made
+            errors.append({"error": f"{task.asset.path}: it could not be started ({e}); try again.", "status": CRASHED})
         finally:
             self.free_cores.put(own_cores)
-            self.messages.put(None)
+            error, seconds = next(iter(errors), None), time.monotonic() - start
+            self.messages.put({"end": {"task": task, "written": written, "error": error, "seconds": seconds}})
 
 
 def render_shots(
@@ -154,8 +247,8 @@ def render_shots(
             progress(images, message["of"])
 
     (one,) = list_assets([str(asset)])
-    job = {"asset": asdict(one), "folder": str(folder), "settings": asdict(settings), "cores": []}
-    _run_child(job, receive, set())
+    job = {"asset": asdict(one), "folder": str(folder), "settings": asdict(settings), "terms": {}, "cores": []}
+    run_child(job, receive, set())
     if errors:
         raise InputError(errors[0])
     return read_sequence(Path(folder))
@@ -166,47 +259,6 @@ def cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
-
-
-def _remove_half_written(job: dict) -> None:
-    """Removes what a killed child left behind: `write_sequence` works in a hidden folder."""
-    if "folder" in job:
-        folder = Path(job["folder"])
-        hidden = folder.parent.glob(f".{folder.name}.*")
-    else:
-        hidden = Path(job["out"]).glob(".*")
-    for path in hidden:
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def _run_child(job: dict, receive: Callable[[dict], None], running: set[subprocess.Popen]) -> None:
-    """Runs one job in a child process, which is in `running` meanwhile, and passes on its messages; its death is a
-    message too."""
-    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as tmp:
-        job_file, log = Path(tmp) / "job.json", Path(tmp) / "log"
-        job_file.write_text(json.dumps(job))
-        command = [sys.executable, "-m", "timesplat.datagen.render_asset", str(job_file), str(log)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
-        running.add(process)
-        said_error = False
-        try:
-            for line in process.stdout:
-                message = json.loads(line)
-                said_error |= "error" in message
-                receive(message)
-            code = process.wait()
-        finally:
-            process.kill()
-            process.wait()
-            running.discard(process)
-            _remove_half_written(job)
-        if code and not said_error:
-            reason = f"signal {-code}" if code < 0 else f"exit code {code}"
-            lines = log.read_text("utf-8", errors="replace").strip().splitlines() if log.exists() else []
-            last = f", last line: {lines[-1][:200]}" if lines else ""
-            receive(
-                {"error": f"{job['asset']['path']}: Blender died on it ({reason}{last}); repair or leave out the file."}
-            )
 
 
 # ---------------------------------------------------------------- the command line
@@ -238,6 +290,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--device", default=defaults.device, choices=["CPU", "GPU"])
     parser.add_argument("--jobs", type=int, default=len(cores()), metavar="N", help="assets at a time (%(default)s)")
+    parser.add_argument("--limit-seconds", type=float, default=3600.0, metavar="S", help="an asset that takes longer, "
+                        "by the clock, is given up (%(default)g)")  # fmt: skip
+    parser.add_argument("--limit-memory", type=float, metavar="GB", help="an asset that needs more is given up "
+                        "(default: no limit)")  # fmt: skip
+    parser.add_argument("--licences", type=Path, metavar="CSV", help="columns licence, author, and one of sha256, "
+                        "path, uid, name that says whose; they stay with every Sequence")  # fmt: skip
+    parser.add_argument("--retry", action="store_true", help="try again what failed in an earlier run")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -248,6 +307,8 @@ def run(args: argparse.Namespace) -> int:
     if not assets:
         raise InputError("render: there is nothing to render; give an asset, a folder, or --zoo 0-9.")
     settings = RenderSettings(**{name: getattr(args, name) for name in asdict(RenderSettings())})
+    limits = Limits(args.limit_seconds, args.limit_memory)
+    licences = read_licences(args.licences) if args.licences else None
     with tqdm(total=0, unit="asset", disable=None) as bar:
 
         def progress(done: int, total: int, images: int) -> None:
@@ -258,9 +319,19 @@ def run(args: argparse.Namespace) -> int:
             bar.write(sentence, file=sys.stderr)
 
         folders, failures = render_assets(
-            assets, args.out, settings, root=args.root, jobs=args.jobs, report=report, progress=progress
+            assets,
+            args.out,
+            settings,
+            root=args.root,
+            jobs=args.jobs,
+            limits=limits,
+            licences=licences,
+            retry=args.retry,
+            report=report,
+            progress=progress,
         )
-    print(f"{len(folders)} sequences in {args.out}" + (f", {len(failures)} failed" if failures else ""))
+    failed = f", {len(failures)} failed (--retry tries them again)" if failures else ""
+    print(f"{len(folders)} sequences in {args.out}{failed}; {args.out / CSV} has them all")
     return 2 if failures else 0
 
 

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One asset in a process of its own: `python -m timesplat.datagen.render_asset JOB.json LOG`, started by `farm`.
+"""One asset in a process of its own: `python -m timesplat.datagen.render_asset JOB.json LOG`, by `render_child`.
 
 The job names the asset, the settings, and where to write; messages go to stdout as JSON lines ({"image": n,
-"of": total}, {"written": folder}, {"warning": …}, {"error": …}), all that Blender prints goes to the log.
+"of": total}, {"written": folder}, {"warning": …}, {"error": …, "status": …}), all that Blender prints goes to the log.
 What needs Blender is imported late: it starts its threads, and prints, only after `main` has made ready for that.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
 import math
 import os
 import re
+import signal
 import sys
+import time
 import zlib
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from .render_index import CRASHED, MEMORY, REFUSED
 from .render_job import (
     ALL_CLIPS,
     CONSECUTIVE,
@@ -35,10 +39,12 @@ from .sequence import InputError, Normalisation, distinct
 
 def run_job(job: dict, send: Callable[[dict], None]) -> None:
     """Opens the asset and renders each of its clips that the settings choose. `job`: "asset" (Asset as a dict),
-    "settings" (RenderSettings as a dict), and "out" (a folder for a folder a clip) or "folder" (that of the one clip).
-    Raises InputError."""
+    "settings" (RenderSettings as a dict), "terms" (entries of the provenance), and "out" (a folder for a folder a clip)
+    or "folder" (that of the one clip). Raises InputError."""
     settings, asset = RenderSettings(**job["settings"]), Asset(**job["asset"])
+    start = time.monotonic()
     opened, provenance = _open(asset)
+    provenance |= job["terms"]
     for warning in opened.warnings:
         send({"warning": warning})
     if settings.device == "GPU":
@@ -53,7 +59,8 @@ def run_job(job: dict, send: Callable[[dict], None]) -> None:
             if not clip.actions and not simulated:
                 simulate_scene([c for c in clips if not c.actions], settings)
                 simulated = True
-            _render_clip(clip, asset, folder, settings, provenance, send)
+            _render_clip(clip, asset, folder, settings, provenance, start, send)
+            start = time.monotonic()
         send({"written": str(folder)})
 
 
@@ -76,9 +83,15 @@ def _open(asset: Asset):
 
 
 def _render_clip(
-    clip, asset: Asset, folder: Path, settings: RenderSettings, provenance: dict, send: Callable[[dict], None]
+    clip,
+    asset: Asset,
+    folder: Path,
+    settings: RenderSettings,
+    provenance: dict,
+    started: float,
+    send: Callable[[dict], None],
 ) -> None:
-    """Renders the clip that the open scene plays into the Sequence `folder`."""
+    """Renders the clip that the open scene plays into the Sequence `folder`. started: as `capture` takes it."""
     from .scene.clips import changes_looks
     from .scene.measure import holds_still, normalisation
     from .scene.rescale import LARGEST, SMALLEST, rescaled
@@ -96,14 +109,14 @@ def _render_clip(
     provenance = provenance | {"warnings": warnings, "clip": clip.name, "scene_frames": frames, "cameras_seed": seed}
     norm, aabb = normalisation(frames, name=asset.path)
     if SMALLEST <= norm.scale <= LARGEST:
-        _capture(frames, norm, aabb, 1.0, seed, folder, settings, provenance, send)
+        _capture(frames, norm, aabb, 1.0, seed, folder, settings, provenance, started, send)
         return
     unit = 1 / norm.scale
     with rescaled(unit):
         norm, aabb = normalisation(frames, name=asset.path)
         if not SMALLEST <= norm.scale <= LARGEST:
             raise InputError(f"{asset.path}: it is too small or too large to be rendered; scale it by {unit:.0e}.")
-        _capture(frames, norm, aabb, unit, seed, folder, settings, provenance, send)
+        _capture(frames, norm, aabb, unit, seed, folder, settings, provenance, started, send)
 
 
 def _capture(
@@ -115,6 +128,7 @@ def _capture(
     folder: Path,
     settings: RenderSettings,
     provenance: dict,
+    started: float,
     send: Callable[[dict], None],
 ) -> None:
     """Renders these frames of the open scene, which is `unit` times as large as the asset."""
@@ -147,6 +161,7 @@ def _capture(
             seed=seed % 2**20,
         ),
         provenance=provenance,
+        started=started,
         refuse_empty=True,
         progress=progress,
     )
@@ -236,6 +251,16 @@ def _folder_names(clips: list) -> dict:
     return dict(zip(distinct(plain), clips, strict=True))
 
 
+def die_with_parent() -> None:
+    """Where the system can: when the run is killed, this process goes too, in the middle of what Blender does; else it
+    would write where the run that is started again does. (Elsewhere it goes when it next has something to say.)"""
+    if sys.platform == "linux":
+        parent = os.getppid()
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+        if os.getppid() != parent:
+            os._exit(1)
+
+
 def main(job_file: str, log: str) -> int:
     """0 if all is written, 2 after an InputError, 1 after anything else; the reason has been sent."""
     job = json.loads(Path(job_file).read_text())
@@ -243,6 +268,7 @@ def main(job_file: str, log: str) -> int:
     sink = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(sink, 1)
     os.dup2(sink, 2)
+    die_with_parent()
     if job["cores"] and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, job["cores"])  # before Blender starts its threads
 
@@ -252,13 +278,15 @@ def main(job_file: str, log: str) -> int:
     try:
         run_job(job, send)
     except InputError as e:
-        send({"error": str(e)})
+        send({"error": str(e), "status": REFUSED})
         return 2
     except MemoryError:
-        send({"error": f"{job['asset']['path']}: the memory does not suffice; render it smaller or alone."})
+        sentence = f"{job['asset']['path']}: the memory does not suffice; render it smaller or alone."
+        send({"error": sentence, "status": MEMORY})
         return 1
     except Exception as e:
-        send({"error": f"{job['asset']['path']}: rendering failed ({type(e).__name__}: {e}); please report it."})
+        sentence = f"{job['asset']['path']}: rendering failed ({type(e).__name__}: {e}); please report it."
+        send({"error": sentence, "status": CRASHED})
         return 1
     return 0
 

@@ -125,6 +125,14 @@ def zoo_seed(asset: str) -> str | None:
     return match[1] if match else None
 
 
+def file_sha256(asset: Asset) -> str:
+    """In hexadecimal; "" for what is no file, and for one that cannot be read."""
+    try:
+        return hashlib.sha256(Path(asset.path).read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
 def rendered_clips(folder: Path, asset: Asset, settings: RenderSettings) -> int:
     """How many clips the run had that made the Sequence in `folder`, if it is whole and shows this very asset with
     these settings; else 0."""
@@ -133,15 +141,14 @@ def rendered_clips(folder: Path, asset: Asset, settings: RenderSettings) -> int:
         same = provenance["settings"] == asdict(settings) and provenance["asset"] == Path(asset.path).name
         if same and not zoo_seed(asset.path):
             same = provenance["path"] == asset.below_root
-            same &= provenance["sha256"] == hashlib.sha256(Path(asset.path).read_bytes()).hexdigest()
+            same &= provenance["sha256"] == file_sha256(asset)
         return provenance["clips"] if same else 0
     except (InputError, KeyError, OSError):
         return 0
 
 
-def finished_sequences(folder: Path, asset: Asset, settings: RenderSettings) -> list[Path]:
-    """The Sequences of this asset with these settings below `folder`, if all its clips are there and whole; else
-    none."""
+def rendered_sequences(folder: Path, asset: Asset, settings: RenderSettings) -> tuple[list[Path], bool]:
+    """The Sequences of this asset with these settings below `folder`, and whether all its clips are there and whole."""
     folders = [file.parent for file in sorted(folder.glob("*/transforms.json"))]
     clips = {f: count for f in folders if (count := rendered_clips(f, asset, settings))}
-    return list(clips) if clips and len(clips) == max(clips.values()) else []
+    return list(clips), bool(clips) and len(clips) == max(clips.values())

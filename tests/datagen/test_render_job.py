@@ -7,8 +7,8 @@ from timesplat.datagen.render_job import (
     Asset,
     RenderSettings,
     asset_name,
-    finished_sequences,
     list_assets,
+    rendered_sequences,
     zoo_seed,
 )
 from timesplat.datagen.sequence import InputError
@@ -88,7 +88,7 @@ def test_files_given_alone(tmp_path):
 
 def test_nothing_is_finished_where_nothing_is(tmp_path):
     asset = Asset("a.glb", "a")
-    assert finished_sequences(tmp_path / "no", asset, RenderSettings()) == []
+    assert rendered_sequences(tmp_path / "no", asset, RenderSettings()) == ([], False)
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "transforms.json").write_text("{")
-    assert finished_sequences(tmp_path, asset, RenderSettings()) == []
+    assert rendered_sequences(tmp_path, asset, RenderSettings()) == ([], False)

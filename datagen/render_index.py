@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The table of a run, `index.parquet` with `index.csv` beside: a row for every Sequence, and one for every asset that
+failed, so that nothing is lost.
+
+All of it is found again on disk, in the Sequences' provenance and in the `failed.json` that is in a failed asset's
+folder, so that a run which was killed and started again writes the same table, seconds included: they stay as they
+were measured.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from .errors import InputError
+from .licences import Terms
+from .render_job import Asset
+
+RENDERED = "rendered"
+FAILURES = REFUSED, CRASHED, TIME, MEMORY = "refused", "crashed", "time", "memory"  # why an asset failed
+CSV, PARQUET, FAILED = "index.csv", "index.parquet", "failed.json"
+
+
+@dataclass(frozen=True, order=True)
+class Row:
+    """One Sequence, or one asset that failed. Text is "" and a seed -1 where there is none."""
+
+    name: str  # of the asset: its folder below the run's
+    sequence: str  # folder of the Sequence below the run's
+    source: str  # path of the file below the root, or "zoo:SEED"
+    uid: str = ""
+    sha256: str = ""
+    licence: str = ""
+    author: str = ""
+    clip: str = ""
+    camera_seed: int = -1
+    blender: str = ""
+    timesplat: str = ""
+    seconds: float = 0.0  # by the clock: opening the file (with its first clip), measuring, rendering, writing
+    status: str = RENDERED  # or one of FAILURES
+    sentence: str = ""  # why it failed, or what there is to be said of the Sequence
+
+
+def sequence_row(out: Path, folder: Path, asset: Asset) -> Row:
+    """Of the Sequence in `folder`, which is below the run's folder `out`. Raises InputError."""
+    path = folder / "transforms.json"
+    try:
+        p = json.loads(path.read_text(encoding="utf-8"))["provenance"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: it is missing or damaged; render the Sequence again.") from None
+    return Row(
+        asset.name,
+        folder.relative_to(out).as_posix(),
+        asset.below_root,
+        **{name: str(p.get(name, "")) for name in ("uid", "sha256", "licence", "author", "clip")},
+        camera_seed=int(p.get("cameras_seed", -1)),
+        blender=str(p.get("blender", "")),
+        timesplat=str(p.get("timesplat", "")),
+        seconds=float(p.get("seconds", 0)),
+        sentence=" ".join(p.get("warnings", [])),
+    )
+
+
+def failure_row(
+    asset: Asset, sentence: str, status: str, *, sha256: str = "", terms: Terms | None = None, seconds: float = 0.0
+) -> Row:
+    """Of an asset that failed; status: one of FAILURES."""
+    more = {"sha256": sha256, "seconds": round(seconds, 2), "status": status, "sentence": sentence}
+    return Row(asset.name, "", asset.below_root, **(terms or Terms()).as_provenance(), **more)
+
+
+# ---------------------------------------------------------------- failures, which the next run finds
+
+
+def keep_failure(out: Path, row: Row, conditions: dict) -> None:
+    """Writes why an asset failed into its folder. conditions: under which it did (settings, limits)."""
+    folder = out / row.name
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / FAILED, (json.dumps({"conditions": conditions, "row": asdict(row)}, indent=1) + "\n").encode())
+
+
+def kept_failure(out: Path, asset: Asset, sha256: str, conditions: dict) -> Row | None:
+    """The failure of this very file under these conditions; None where there is none."""
+    try:
+        kept = json.loads((out / asset.name / FAILED).read_text(encoding="utf-8"))
+        row = Row(**kept["row"])
+        same = kept["conditions"] == conditions and row.source == asset.below_root and row.sha256 == sha256
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return row if same else None
+
+
+def forget_failure(out: Path, asset: Asset) -> None:
+    """Removes what `keep_failure` wrote."""
+    (out / asset.name / FAILED).unlink(missing_ok=True)
+
+
+def set_terms(folder: Path, terms: Terms) -> None:
+    """Writes the terms into a finished Sequence where it has others."""
+    path = folder / "transforms.json"
+    d = json.loads(path.read_text(encoding="utf-8"))
+    new = d["provenance"] | terms.as_provenance()
+    if new != d["provenance"]:
+        d["provenance"] = new
+        _write(path, json.dumps(d, indent=1).encode())
+
+
+# ---------------------------------------------------------------- the table
+
+
+def write_index(out: Path, rows: Iterable[Row]) -> None:
+    """Both files, sorted, each whole or as it was. Rows of other assets of earlier runs stay in it, while
+    their Sequences do. Raises InputError without pyarrow."""
+    pyarrow, parquet = needed()
+    rows = list(rows)
+    named = {row.name.lower() for row in rows}
+    others = [row for row in read_index(out) if row.name.lower() not in named]
+    rows = sorted([*rows, *(row for row in others if (out / row.sequence).is_dir())])
+    out.mkdir(parents=True, exist_ok=True)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [f.name for f in fields(Row)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    _write(out / CSV, text.getvalue().encode("utf-8", "surrogateescape"))
+    types = {"int": pyarrow.int64(), "float": pyarrow.float64()}
+    schema = pyarrow.schema([(f.name, types.get(str(f.type), pyarrow.string())) for f in fields(Row)])
+    whole = [{k: _sayable(v) for k, v in asdict(row).items()} for row in rows]
+    sink = io.BytesIO()
+    parquet.write_table(pyarrow.Table.from_pylist(whole, schema), sink, compression="zstd")
+    _write(out / PARQUET, sink.getvalue())
+
+
+def read_index(out: Path) -> list[Row]:
+    """The rows in `index.csv` of a run's folder; none where there is no table. Raises InputError for one that is
+    damaged."""
+    path = out / CSV
+    try:
+        with open(path, newline="", encoding="utf-8", errors="surrogateescape") as f:
+            return [_row(d) for d in csv.DictReader(f)]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError, KeyError) as e:
+        raise InputError(f"{path}: the table is damaged ({e}); remove it, and render makes it anew.") from None
+
+
+def _row(d: dict[str, str]) -> Row:
+    return Row(**d | {"camera_seed": int(d["camera_seed"]), "seconds": float(d["seconds"])})  # type: ignore[arg-type]
+
+
+def _sayable(value):
+    """Parquet knows no bytes in text; a file's name may hold some."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+
+
+def needed():
+    """pyarrow and its parquet. Raises InputError where it is not installed."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ModuleNotFoundError:
+        raise InputError(
+            "render: pyarrow is missing, which writes the table; pip install 'timesplat[render]'."
+        ) from None
+    return pyarrow, pyarrow.parquet
+
+
+def _write(path: Path, data: bytes) -> None:
+    """A file, whole or as it was."""
+    tmp = path.with_name(f".{path.name}.tmp")  # the same one, so that a killed run leaves none for good
+    tmp.write_bytes(data)
+    tmp.replace(path)
