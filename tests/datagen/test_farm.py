@@ -2,16 +2,23 @@
 import argparse
 import json
 import os
+import random
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import bpy
 import numpy as np
+import pyarrow.parquet
 import pytest
 
 from timesplat.datagen import farm
 from timesplat.datagen.farm import render_assets, render_shots
+from timesplat.datagen.licences import Licences
+from timesplat.datagen.render_index import Row, read_index
 from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, read_sequence
@@ -46,8 +53,13 @@ def assets(tmp_path_factory):
 
 def test_a_folder_of_assets(assets, tmp_path):
     said, counts = [], []
+    licences = Licences([{"name": "still", "licence": "CC0-1.0", "author": "Ann"}])
     folders, failures = render_assets(
-        [str(assets)], tmp_path, SMALL, jobs=2, report=said.append, progress=lambda *n: counts.append(n)
+        *([str(assets)], tmp_path, SMALL),
+        jobs=2,
+        licences=licences,
+        report=said.append,
+        progress=lambda *n: counts.append(n),
     )
     assert {f.relative_to(tmp_path).as_posix() for f in folders} == {"moving/long-way", "still/static"}
     assert failures == said and len(said) == 1 and "cut.glb" in said[0] and said[0].endswith(".")
@@ -63,6 +75,27 @@ def test_a_folder_of_assets(assets, tmp_path):
     still = read_sequence(tmp_path / "still" / "static")
     assert (still.frame_start, still.frame_end, len(still.views)) == (0, 0, 1)
     assert not list(tmp_path.rglob(".*"))
+    cut, moving, quiet = rows = read_index(tmp_path)
+    assert (cut.name, cut.sequence, cut.status, cut.sentence) == ("cut", "", "refused", said[0])
+    assert len(cut.sha256) == 64 and cut.seconds > 0
+    assert (moving.sequence, moving.source, moving.clip) == ("moving/long-way", "moving.glb", "long way")
+    assert (moving.sha256, moving.camera_seed, moving.seconds) == (p["sha256"], p["cameras_seed"], p["seconds"])
+    assert (quiet.licence, quiet.author, quiet.uid, moving.licence) == ("CC0-1.0", "Ann", "still", "")
+    assert (still.provenance["licence"], still.provenance["author"]) == ("CC0-1.0", "Ann")
+    table = pyarrow.parquet.read_table(tmp_path / "index.parquet").to_pylist()
+    assert [Row(**row) for row in table] == rows
+
+    start = time.monotonic()  # once more: nothing is opened, what failed is told again, and the table stays as it is
+    before = (tmp_path / "index.parquet").read_bytes()
+    again, failed = render_assets([str(assets)], tmp_path, SMALL, licences=licences, retry=False, report=said.append)
+    assert (
+        sorted(again) == sorted(folders) and failed == said[:1] == said[1:] and time.monotonic() - start < cut.seconds
+    )
+    assert (tmp_path / "index.parquet").read_bytes() == before
+    other = Licences([{"name": "moving", "licence": "MIT"}])
+    render_assets([str(assets / "moving.glb")], tmp_path, SMALL, root=assets, licences=other)
+    assert [r.licence for r in read_index(tmp_path)] == ["", "MIT", "CC0-1.0"]
+    assert read_sequence(tmp_path / "moving" / "long-way").provenance["licence"] == "MIT"
 
 
 def test_a_second_run_renders_only_what_is_missing(assets, tmp_path):
@@ -154,8 +187,63 @@ def test_a_child_that_dies_is_one_sentence(assets, tmp_path, monkeypatch):
     assert not half.exists()
     assert not folders and len(failures) == 1
     assert "signal 11" in failures[0] and "last words" in failures[0] and "still.glb" in failures[0]
+    (row,) = read_index(tmp_path / "out")
+    assert (row.status, row.sentence) == ("crashed", failures[0])
     with pytest.raises(InputError, match="signal 11"):
         render_shots(str(assets / "still.glb"), tmp_path / "x", "random", SMALL)
+
+
+# ---------------------------------------------------------------- killed, and started again
+
+
+def everything(folder):
+    """{path: what is in the file} of a run, without the seconds that things took and without what was not whole."""
+    found = {}
+    for file in sorted(f for f in folder.rglob("*") if f.is_file()):
+        name, data = file.relative_to(folder).as_posix(), file.read_bytes()
+        if file.name == "index.parquet":
+            data = pyarrow.parquet.read_table(file).drop_columns("seconds").to_pylist()
+        elif file.name == "index.csv":
+            data = [replace(row, seconds=0) for row in read_index(folder)]
+        elif file.name in ("transforms.json", "failed.json"):
+            data = json.loads(data)
+            (data["provenance"] if "provenance" in data else data["row"]).pop("seconds")
+        found[name] = data
+    return found
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize(
+    "kills", [3, pytest.param(20, marks=pytest.mark.slow)]
+)  # slow: Blender starts 20 times or more
+def test_killed_at_any_moment_it_ends_with_the_same(assets, tmp_path, kills):
+    words = [str(assets), "--size", "16", "--samples", "1", "--frames", "2", "--rig", "alternating", "--clip", "all"]
+    command = [sys.executable, "-m", "timesplat.cli", "render", *words, "--jobs", "2", "--out"]
+
+    def start(out):
+        pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        return subprocess.Popen([*command, str(out)], start_new_session=True, **pipes)
+
+    begin = time.monotonic()
+    whole = start(tmp_path / "whole")
+    told = whole.communicate()[1].decode()
+    took = time.monotonic() - begin
+    assert whole.returncode == 2 and "cut.glb" in told and len(read_index(tmp_path / "whole")) == 4
+    moments, killed = random.Random(kills), 0
+    for i in range(kills):
+        process = start(tmp_path / "killed")
+        try:
+            process.wait(moments.uniform(0.1, 1.0) * took)
+        except subprocess.TimeoutExpired:
+            # the whole group, or the parent alone, whose children have to notice
+            (os.killpg if i % 2 else os.kill)(process.pid, signal.SIGKILL)
+            process.wait()
+            killed += 1
+        process.stderr.close()
+    assert killed
+    last = start(tmp_path / "killed")
+    last.communicate()
+    assert last.returncode == 2 and everything(tmp_path / "killed") == everything(tmp_path / "whole")
 
 
 # ---------------------------------------------------------------- what is not as it should be
