@@ -142,6 +142,20 @@ def render(args: argparse.Namespace) -> int:
     return run(args)
 
 
+def curate_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.curation.curate import add_arguments
+
+    add_arguments(p)
+
+
+def curate(args: argparse.Namespace) -> int:
+    """Sort Sequences into the sets that training draws from, HQ4D, 4D and 3D, by how much they move, and throw out
+    duplicates and artefacts: curation.csv, in which each decision can be overridden, and curation.html to look at."""
+    from .datagen.curation.curate import run
+
+    return run(args)
+
+
 # ---------------------------------------------------------------- train, reconstruct
 
 
@@ -482,6 +496,7 @@ def extension(args: argparse.Namespace) -> int:
 COMMANDS = {
     "demo": (demo_arguments, demo, "the whole road in one go, with pictures"),
     "render": (render_arguments, render, "assets to Sequences (Blender)"),
+    "curate": (curate_arguments, curate, "Sequences into sets for training, and out"),
     "inspect": (inspect_arguments, inspect, "what others' pictures and cameras are"),
     "import": (import_arguments, import_, "others' pictures to a Sequence"),
     "reconstruct": (reconstruct_arguments, reconstruct, "a Sequence to a 4D Gaussian asset"),

@@ -84,7 +84,7 @@ def capture(
     *,
     provenance: dict | None = None,
     started: float | None = None,
-    refuse_empty: bool = False,
+    refuse_empty: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Sequence:
     """Renders `shots` of the open scene and writes the Sequence `out`; returns it as read back.
@@ -92,7 +92,7 @@ def capture(
     shots           cameras in normalised space; `Shot.frame` counts the clip's frames, 0…len(subject.frames)-1
     provenance      what the Sequence says of where it came from
     started         when work on it began, by time.monotonic(): the provenance says how many seconds ago; None = now
-    refuse_empty    pictures of which none shows anything are an InputError
+    refuse_empty    pictures of which none shows anything are an InputError that names this
     progress        called with (images done, images in all) after every frame
 
     Motion vectors hold for a camera that stands still, and for one step of `subject.frames`: where two entries
@@ -130,10 +130,10 @@ def capture(
                     shown |= _write_view(view, name, channels, folder, subject, settings)
                     done += 1
                 progress(done, len(shots))
-            if refuse_empty and not shown:
+            if refuse_empty is not None and not shown:
                 raise InputError(
-                    f"{out}: no picture shows anything, for what is there is transparent or out of sight; look at its "
-                    "materials and visibility."
+                    f"{refuse_empty}: no picture shows anything, for what is there is transparent or out of sight; "
+                    "look at its materials and visibility."
                 )
         seq.provenance["seconds"] = round(time.monotonic() - started, 2)
 

@@ -109,17 +109,18 @@ def _render_clip(
     provenance = provenance | {"warnings": warnings, "clip": clip.name, "scene_frames": frames, "cameras_seed": seed}
     norm, aabb = normalisation(frames, name=asset.path)
     if SMALLEST <= norm.scale <= LARGEST:
-        _capture(frames, norm, aabb, 1.0, seed, folder, settings, provenance, started, send)
+        _capture(asset.path, frames, norm, aabb, 1.0, seed, folder, settings, provenance, started, send)
         return
     unit = 1 / norm.scale
     with rescaled(unit):
         norm, aabb = normalisation(frames, name=asset.path)
         if not SMALLEST <= norm.scale <= LARGEST:
             raise InputError(f"{asset.path}: it is too small or too large to be rendered; scale it by {unit:.0e}.")
-        _capture(frames, norm, aabb, unit, seed, folder, settings, provenance, started, send)
+        _capture(asset.path, frames, norm, aabb, unit, seed, folder, settings, provenance, started, send)
 
 
 def _capture(
+    name: str,
     frames: list,
     norm: Normalisation,
     aabb,
@@ -131,7 +132,7 @@ def _capture(
     started: float,
     send: Callable[[dict], None],
 ) -> None:
-    """Renders these frames of the open scene, which is `unit` times as large as the asset."""
+    """Renders these frames of the open scene, which is `unit` times as large as the asset `name`."""
     from .capture import Subject, capture
     from .displace import displacements
     from .render_setup import CaptureSettings
@@ -162,7 +163,7 @@ def _capture(
         ),
         provenance=provenance,
         started=started,
-        refuse_empty=True,
+        refuse_empty=name,
         progress=progress,
     )
 

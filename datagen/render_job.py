@@ -128,7 +128,7 @@ def zoo_seed(asset: str) -> str | None:
 def file_sha256(asset: Asset) -> str:
     """In hexadecimal; "" for what is no file, and for one that cannot be read."""
     try:
-        return hashlib.sha256(Path(asset.path).read_bytes()).hexdigest()
+        return hashlib.sha256(Path(asset.path).read_bytes()).hexdigest() if Path(asset.path).is_file() else ""
     except OSError:
         return ""
 

@@ -68,7 +68,10 @@ LAYERS = {
         ("datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
         ("datagen.sequence",),
         ("datagen.readers",),
-        ("datagen.inspection", "datagen.importing"),
+        ("datagen.curation.measures",),
+        ("datagen.curation.duplicates", "datagen.curation.decisions"),
+        ("datagen.curation.page",),
+        ("datagen.inspection", "datagen.importing", "datagen.curation"),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.licences", "datagen.render_index"),
         ("datagen.render_setup", "datagen.tracks", "datagen.render_child"),
@@ -89,7 +92,15 @@ LAYERS = {
     ),
 }
 # What `model` knows of `datagen`: how views are read and written, none of what renders them.
-MODEL_READS = {"datagen.passes", "datagen.readers", "datagen.rigs", "datagen.sequence", "datagen.track_file"}
+MODEL_READS = {
+    "datagen.curation.decisions",
+    "datagen.curation.measures",
+    "datagen.passes",
+    "datagen.readers",
+    "datagen.rigs",
+    "datagen.sequence",
+    "datagen.track_file",
+}
 # What the product, all of `model` but these, does not know; they may use every layer up to the one named.
 ASIDE = {"model.baselines": "model.methods", "model.training": "model.inference"}
 

@@ -23,7 +23,7 @@ def check_gltf(path: Path, root: Path) -> None:
     try:
         document, binary = _read_document(path)
         buffers = [x.get("uri") for x in document.get("buffers", [])]
-    except (ValueError, struct.error, AttributeError, TypeError) as e:
+    except (ValueError, struct.error, AttributeError, TypeError, RecursionError) as e:
         raise InputError(f"{path}: it is damaged ({e}); export it again.") from None
     for uri in buffers:
         if uri and not uri.startswith("data:"):

@@ -1,39 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The groups of clips that training draws from by weight, as the paper's data has them (appendix, "Dataset Curation"):
-`hq4d` moves much, but not wildly; `4d` is all else that moves; `3d` are still objects, displaced or not.
-"""
+"""The groups of clips that training draws from by weight: the sets of `timesplat curate`, or where that was not called,
+what it would say of their motion alone."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
+from ...datagen.curation.decisions import SETS as GROUPS
+from ...datagen.curation.decisions import set_of
 from ...datagen.sequence import InputError
-
-GROUPS = ("hq4d", "4d", "3d")
-
-
-@dataclass(frozen=True)
-class MotionBounds:
-    """Between the groups, in units of `dataset.measure_motion`. (The paper keeps 3,000 of 32,000 objects, "sufficient
-    but not overly aggressive"; of 135 of ours, animated files and zoo, these keep 59.)"""
-
-    still: float = 0.01  # nothing moves below
-    sufficient: float = 0.25  # hq4d from here …
-    aggressive: float = 0.45  # … to below this
-
-
-MOTION_BOUNDS = MotionBounds()
 
 
 def group_of(meta: Mapping[str, str]) -> str:
     """The group of a packed clip by its metadata; one of unknown motion (NaN) is of 4d."""
-    motion = float(meta["motion"])
-    if meta["displaced"] == "True" or meta["frames"] == "1" or motion < MOTION_BOUNDS.still:
-        return "3d"
-    return "hq4d" if MOTION_BOUNDS.sufficient <= motion < MOTION_BOUNDS.aggressive else "4d"
+    return set_of(float(meta["motion"]), meta["displaced"] == "True" or meta["frames"] == "1")
 
 
 def parse_mix(text: str) -> dict[str, float] | None:

@@ -17,14 +17,16 @@ from safetensors.torch import save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from ...datagen.curation.decisions import CURATION, OUT, decided
+from ...datagen.curation.measures import motion_of
 from ...datagen.readers import described_by, open_sequence, sequences_in
 from ...datagen.rigs import CANONICAL
 from ...datagen.sequence import InputError, Sequence
-from ..views import BACKGROUND, Views, shrink
+from ..views import Views, shrink
 from .clip_groups import GROUPS, group_of, group_probabilities
 from .view_sampling import ClipLayout, sample_views
 
-PACKED_VERSION = 2  # of packed files; others are made anew
+PACKED_VERSION = 3  # of packed files; others are made anew
 
 
 @dataclass
@@ -50,19 +52,26 @@ class ClipDataset:
     ):
         """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
         than what was rendered. sampling: see view_sampling.py; mix: see clip_groups.py; has_depth: whether inputs come
-        with depth and flow. Raises InputError where there is no Sequence, none that the mix would draw, or one without
-        the passes that are needed."""
+        with depth and flow. Where `timesplat curate` was called, its sets are the groups, and what it threw out is left
+        out. Raises InputError where there is no Sequence, none that the mix would draw, or one without the passes that
+        are needed."""
         self.shrink, self.sampling, self.has_depth = shrink, sampling, has_depth
         folders = list(folders)
         found = [p for f in folders for p in sequences_in(f)]
         if not found:
             raise InputError(f"{folders[0]}: no Sequence in it; render some with `timesplat render`.")
+        curated = decided(found)
+        found = [p for p in found if curated.get(p) != OUT]
+        if not found:
+            raise InputError(
+                f"{folders[0]}: {CURATION} throws out all of its Sequences; put some back by its column override."
+            )
         bar = tqdm(found, desc="packing", unit="clip", leave=False, disable=None)
         self.paths = [pack(f, cache, has_depth) for f in bar]
         self.groups: dict[str, list[Path]] = {g: [] for g in GROUPS}
-        for path in self.paths:
+        for folder, path in zip(found, self.paths, strict=True):
             with safe_open(path, "pt") as f:
-                self.groups[group_of(f.metadata())].append(path)
+                self.groups[curated.get(folder) or group_of(f.metadata())].append(path)
         self.probabilities = group_probabilities(mix, {g: len(paths) for g, paths in self.groups.items()})
 
     def __str__(self) -> str:
@@ -113,8 +122,10 @@ def pack(folder: Path, cache: Path, has_depth: bool = True) -> Path:
         "cameras": json.dumps(names),
         "frames": str(seq.frame_end - seq.frame_start + 1),
         "asset": str(seq.provenance.get("asset", folder.parent.name)),
-        "motion": str(measure_motion(tensors, names)),
+        "motion": str(motion_of(canonical_pictures(tensors, names))),
         "displaced": str(bool(seq.provenance.get("settings", {}).get("displace"))),
+        "licence": str(seq.provenance.get("licence", "")),
+        "author": str(seq.provenance.get("author", "")),
     }
     Path(cache).mkdir(parents=True, exist_ok=True)
     tmp = path.with_suffix(f".{os.getpid()}.tmp")  # several trainings may pack at a time
@@ -158,21 +169,10 @@ def packed_tensors(seq: Sequence, has_depth: bool) -> dict[str, Tensor]:
     }
 
 
-def measure_motion(tensors: dict[str, Tensor], names: list[str]) -> float:
-    """How much a packed clip moves (tensors: see `packed_tensors`; names of its cameras): the greatest L1 distance
-    between two frames of a camera that stands still (paper, appendix, "Dataset Curation"), mean over the canonical
-    cameras. 0..1 per colour channel over white, per pixel that the object covers at any of the frames, so that slim
-    objects count as stout ones do; NaN where no canonical camera has two frames."""
-    found = []
-    for name in CANONICAL:
-        here = (tensors["camera"] == names.index(name)) if name in names else torch.zeros(1, dtype=torch.bool)
-        if here.sum() < 2:
-            continue
-        rgba = tensors["rgba"][here][..., :4].float() / 255
-        over = (rgba[..., :3] * rgba[..., 3:] + BACKGROUND - BACKGROUND * rgba[..., 3:]).flatten(1)
-        covered = (rgba[..., 3] > 0).any(0).sum().clamp_min(1)
-        found.append(float(torch.cdist(over, over, p=1).max() / (3 * covered)))
-    return float(np.mean(found)) if found else float("nan")
+def canonical_pictures(tensors: dict[str, Tensor], names: list[str]) -> list[np.ndarray]:
+    """(F,H,W,4) uint8 of each canonical camera of a packed clip (tensors: see `packed_tensors`; its cameras' names)."""
+    chosen = [names.index(name) for name in CANONICAL if name in names]
+    return [tensors["rgba"][tensors["camera"] == i][..., :4].numpy() for i in chosen]
 
 
 def read_views(packed, rows: np.ndarray, frame_step: float, has_depth: bool) -> Views:

@@ -322,8 +322,8 @@ def test_behind_a_faint_surface_is_what_it_shows(plane, tmp_path):
 def test_pictures_that_show_nothing_can_be_a_failure(plane, tmp_path):
     plane.data.materials[0] = glass(0.0)
     shots, settings = rigs.canonical([0]), CaptureSettings(size=16, samples=1, tracks=None)
-    with pytest.raises(InputError, match=r"s: no picture shows anything.*;.*\.$"):
-        capture(shots, tmp_path / "s", Subject([0], NORM), settings, refuse_empty=True)
+    with pytest.raises(InputError, match=r"^a.glb: no picture shows anything.*;.*\.$"):
+        capture(shots, tmp_path / "s", Subject([0], NORM), settings, refuse_empty="a.glb")
     assert not list(tmp_path.iterdir())
     assert not capture(shots, tmp_path / "s", Subject([0], NORM), settings).load_image(0).any()
 

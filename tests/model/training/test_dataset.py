@@ -1,11 +1,17 @@
 """Training data: what comes back is what was rendered, and samples are what they are said to be."""
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from timesplat.datagen.curation.curate import curate
+from timesplat.datagen.curation.decisions import read_decisions, write_decisions
+from timesplat.datagen.curation.measures import motion_of
 from timesplat.datagen.sequence import InputError, read_sequence
-from timesplat.model.training.dataset import ClipDataset, measure_motion
+from timesplat.model.training.dataset import ClipDataset, canonical_pictures
 from timesplat.model.views import load_views
 
 
@@ -62,9 +68,25 @@ def clip(distance: float) -> dict:
 
 
 def test_motion_is_the_greatest_distance_between_frames():
-    assert measure_motion(clip(0.0), ["front"]) == 0
-    assert measure_motion(clip(0.4), ["front"]) == pytest.approx(0.4, abs=0.01)
-    assert np.isnan(measure_motion(clip(0.4), ["orbit"]))
+    assert motion_of(canonical_pictures(clip(0.0), ["front"])) == 0
+    assert motion_of(canonical_pictures(clip(0.4), ["front"])) == pytest.approx(0.4, abs=0.01)
+    assert np.isnan(motion_of(canonical_pictures(clip(0.4), ["orbit"])))
+
+
+def test_the_sets_of_a_curation_are_the_groups(sphere_folder, tmp_path):
+    folder = tmp_path / "data"
+    for name in ("a", "b"):
+        shutil.copytree(sphere_folder, folder / name)
+    curate(folder, report=print)
+    table = folder / "curation.csv"
+    rows = read_decisions(table)
+    assert [(d.sequence, d.set) for d in rows] == [("a", "4d"), ("b", "4d")]  # no camera of it stands still
+    write_decisions(table, [replace(rows[0], override="hq4d"), replace(rows[1], override="out")])
+    clips = ClipDataset([folder], tmp_path / "cache")
+    assert {g: len(paths) for g, paths in clips.groups.items()} == {"hq4d": 1, "4d": 0, "3d": 0}
+    write_decisions(table, [replace(d, override="out") for d in rows])
+    with pytest.raises(InputError, match=r"curation\.csv throws out all of its Sequences"):
+        ClipDataset([folder / "a", folder / "b"], tmp_path / "cache")
 
 
 def test_groups_are_drawn_by_their_weights(sphere_folder, tmp_path):
