@@ -9,7 +9,6 @@ gives picture, depth and motion vectors at once.
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 import tempfile
@@ -42,6 +41,7 @@ from .render_setup import (
 )
 from .rigs import Shot
 from .scene.borrow import borrowed
+from .scene.steps import go_to, lengthen_frames
 from .sequence import (
     InputError,
     Normalisation,
@@ -95,10 +95,11 @@ def capture(
     refuse_empty    pictures of which none shows anything are an InputError that names this
     progress        called with (images done, images in all) after every frame
 
-    Motion vectors hold for a camera that stands still, and for one step of `subject.frames`: where two entries
-    are n scene frames apart, they are n times what Blender says of one scene frame.
-    Raises InputError where there is nothing to render. Values that an artist changed without keying them
-    are lost, as after every animation render in Blender; everything else is as before.
+    Motion vectors hold for a camera that stands still, and lead to where the surface is at the entries of
+    `subject.frames` before and after; at the clip's ends, to a step beyond it.
+    Raises InputError where there is nothing to render, and for steps over which Blender gives no motion vectors.
+    Values that an artist changed without keying them are lost, as after every animation render in Blender; everything
+    else is as before.
     """
     settings, started = settings or CaptureSettings(), time.monotonic() if started is None else started
     if not shots:
@@ -179,9 +180,11 @@ def _render_frames(
     and motion."""
     if subject.shift is not None:
         shots = displace.counter_moved(shots, subject.shift)
+    step = _scene_frames_per_frame(subject.frames) if settings.passes else 1
+    if step != 1:
+        lengthen_frames(cameras.stage, step)
     for frame, group in groupby(shots, key=lambda shot: shot.frame):
-        whole = math.floor(subject.frames[frame])
-        cameras.stage.frame_set(whole, subframe=subject.frames[frame] - whole)
+        go_to(cameras.stage, subject.frames[frame], step)
         if settings.engine == "CYCLES":
             cameras.stage.cycles.seed = settings.seed + frame
         cameras.place(list(group))
@@ -214,7 +217,7 @@ def _write_view(
     if settings.passes:
         view.passes = f"passes/{name}.exr"
         passes = to_passes(channels, subject.normalisation.scale)
-        _scale_flow_to_steps(passes, subject.frames, int(view.frame))
+        _hold_still(passes, subject.frames, int(view.frame))
         if subject.shift is not None:
             displace.add_flow(passes, view, subject.shift)
         write_passes(folder / view.passes, passes, channels["combined"] if settings.linear else None)
@@ -242,10 +245,12 @@ def _scene_frames_per_frame(frames: list[float]) -> float:
     return frames[1] - frames[0] if len(frames) > 1 and frames[1] > frames[0] else 1
 
 
-def _scale_flow_to_steps(passes: Passes, frames: list[float], i: int) -> None:
-    """Motion per scene frame -> motion per frame of the clip; a padded frame holds still."""
-    passes.flow_next *= frames[i + 1] - frames[i] if i + 1 < len(frames) else 1
-    passes.flow_prev *= frames[i] - frames[i - 1] if i > 0 else 1
+def _hold_still(passes: Passes, frames: list[float], i: int) -> None:
+    """No motion to a frame of the clip that shows the same scene frame, as padded ones do."""
+    if i + 1 < len(frames) and frames[i + 1] == frames[i]:
+        passes.flow_next[:] = 0
+    if i > 0 and frames[i] == frames[i - 1]:
+        passes.flow_prev[:] = 0
 
 
 def _view(shot: Shot, width: int, height: int) -> View:

@@ -104,6 +104,25 @@ def test_depth_and_motion_are_those_computed_by_hand(plane, tmp_path):
         assert np.isinf(p.depth[far]).all() and (rgba[far] == 0).all() and (rgba[body][:, 3] == 255).all()
 
 
+@pytest.mark.parametrize("frames", [[1, 4, 7], [1, 4.5, 8, 8]])
+def test_motion_over_several_scene_frames_is_exact(plane, tmp_path, frames):
+    """The plane turns 18 degrees and more from frame to frame of the clip: no multiple of one scene frame's motion."""
+    shots = [Shot(i, "still", "r", rigs.spherical(10, 5, 2.6), 60) for i in range(len(frames))]
+    seq = capture(shots, tmp_path / "s", Subject(frames, NORM), CaptureSettings(size=40, samples=16))
+    for i, at in enumerate(frames[:3]):
+        p = seq.load_passes(i)
+        ahead = min(frames[i + 1] if i + 1 < len(frames) else at + 3, 10) - at  # it moves from 0 to 10
+        before = max(frames[i - 1] if i else 2 * at - frames[1], 0) - at
+        _, flow_next, hit = expected(seq.views[i], at, 40, 40, ahead)
+        _, flow_prev, _ = expected(seq.views[i], at, 40, 40, before)
+        body = inside(hit)
+        assert body.sum() > 100
+        assert np.abs(p.flow_next - flow_next)[body].max() < 0.05
+        assert np.abs(p.flow_prev - flow_prev)[body].max() < 0.05
+        _, one, _ = expected(seq.views[i], at, 40, 40, 1)
+        assert i or np.abs(ahead * one - flow_next)[body].max() > 0.2  # what multiplying would be off
+
+
 @pytest.mark.parametrize(("frames", "fps"), [([3, 6], 8), ([3, 3], 24), ([3], 24)])
 def test_seconds_are_those_of_the_scene(plane, tmp_path, frames, fps):
     shots = [Shot(i, "c", "r", rigs.spherical(10, 5, 2.2)) for i in range(len(frames))]
