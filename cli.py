@@ -126,7 +126,20 @@ def import_(args: argparse.Namespace) -> int:
     return 0
 
 
-# ---------------------------------------------------------------- render
+# ---------------------------------------------------------------- fetch, render, curate
+
+
+def fetch_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.objaverse import add_arguments
+
+    add_arguments(p)
+
+
+def fetch(args: argparse.Namespace) -> int:
+    """Fetch objects of Objaverse with their licences, nothing twice, through the package `objaverse`."""
+    from .datagen.objaverse import run
+
+    return run(args)
 
 
 def render_arguments(p: argparse.ArgumentParser) -> None:
@@ -495,6 +508,7 @@ def extension(args: argparse.Namespace) -> int:
 
 COMMANDS = {
     "demo": (demo_arguments, demo, "the whole road in one go, with pictures"),
+    "fetch": (fetch_arguments, fetch, "objects of Objaverse, with their licences"),
     "render": (render_arguments, render, "assets to Sequences (Blender)"),
     "curate": (curate_arguments, curate, "Sequences into sets for training, and out"),
     "inspect": (inspect_arguments, inspect, "what others' pictures and cameras are"),

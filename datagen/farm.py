@@ -128,7 +128,8 @@ class _Run:
     def finish(self, task: _Task, written: list[str], error: dict | None, seconds: float) -> str | None:
         """Notes what became of an asset; the sentence if it failed."""
         self._note_sequences(task, [Path(folder) for folder in written])
-        if not error:
+        # Blender may crash on its way out, after all is written: the next run would find it finished
+        if not error or rendered_sequences(self.out / task.asset.name, task.asset, self.settings)[1]:
             forget_failure(self.out, task.asset)
             return None
         row = failure_row(

@@ -100,10 +100,10 @@ def forget_failure(out: Path, asset: Asset) -> None:
 
 
 def set_terms(folder: Path, terms: Terms) -> None:
-    """Writes the terms into a finished Sequence where it has others."""
+    """Writes the terms, as far as they are known, into a finished Sequence where it has others."""
     path = folder / "transforms.json"
     d = json.loads(path.read_text(encoding="utf-8"))
-    new = d["provenance"] | terms.as_provenance()
+    new = d["provenance"] | {key: text for key, text in terms.as_provenance().items() if text}
     if new != d["provenance"]:
         d["provenance"] = new
         _write(path, json.dumps(d, indent=1).encode())

@@ -64,7 +64,7 @@ LAYERS = {
         ("addon",),
     ),
     "datagen": (
-        ("datagen.errors", "datagen.image_files", "datagen.rigs", "datagen.track_file"),
+        ("datagen.errors", "datagen.image_files", "datagen.rigs", "datagen.track_file", "datagen.objaverse"),
         ("datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
         ("datagen.sequence",),
         ("datagen.readers",),

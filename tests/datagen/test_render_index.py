@@ -102,4 +102,6 @@ def test_terms_that_came_later_go_into_the_sequence(fox):
     set_terms(fox, Terms("fox", "MIT", "Bo"))
     d = json.loads((fox / "transforms.json").read_text())
     assert d["w"] == 8 and (d["provenance"]["licence"], d["provenance"]["author"]) == ("MIT", "Bo")
+    set_terms(fox, Terms("fox"))  # a run without a table of licences
+    assert json.loads((fox / "transforms.json").read_text()) == d
     assert [f.name for f in fox.iterdir()] == ["transforms.json"]
