@@ -225,4 +225,5 @@ def test_files_that_no_renderer_takes(tmp_path, capsys):
         err = capsys.readouterr().err
         assert code == 2 and says in err and "Traceback" not in err
     refused(capsys, "demo", bad, "--out", tmp_path / "demo", says="bad.glb")
-    assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.parent.name not in (tmp_path.name,)]
+    left = {p.name for p in tmp_path.rglob("*") if p.is_file() and p.parent != tmp_path}
+    assert left == {"index.csv", "index.parquet", "failed.json"}  # which say why

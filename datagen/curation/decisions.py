@@ -32,7 +32,7 @@ class Bounds:
     sufficient: float = 0.25  # motion: hq4d from here …
     aggressive: float = 0.45  # … to below this
     border: float = 0.02  # a share of the border that noise does not cover
-    empty: float = 0.1  # of the moments
+    empty: float = 0.25  # of the moments: what appears in the course of a clip is none the worse
     small: float = 0.15  # of the picture's side
     growth: float = 3.0
     variety: float = 0.01

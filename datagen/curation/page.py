@@ -145,16 +145,21 @@ def _figure(folder: Path, d: Decision) -> str:
 
 
 def _thumbnail(folder: Path) -> str:
-    """A data URL of four moments of the clip, from the front where a camera is there; "" where it cannot be read."""
+    """A data URL of four moments of a clip, from the canonical camera that sees most of it at first, or of the four
+    sides of what is still; "" where it cannot be read."""
     from PIL import Image
 
     try:
         seq = read_sequence(folder)
-        camera = next((name for name in CANONICAL if seq.select(camera=name)), seq.views[0].camera)
-        indices = sorted(seq.select(camera=camera), key=lambda i: seq.views[i].frame)
+        names = [name for name in CANONICAL if seq.select(camera=name)] or [seq.views[0].camera]
+        by_time = [sorted(seq.select(camera=name), key=lambda i: seq.views[i].frame) for name in names]
+        indices = max(by_time, key=lambda found: int((seq.load_image(found[0])[..., 3] > 0).sum()))
+        shown = [indices[at] for at in np.linspace(0, len(indices) - 1, _MOMENTS).round().astype(int)]
+        if len(indices) == 1:
+            shown = [found[0] for found in by_time]
         strip = Image.new("RGB", (_MOMENTS * _SIDE, _SIDE), "white")
-        for k, at in enumerate(np.linspace(0, len(indices) - 1, _MOMENTS).round().astype(int)):
-            rgb = (over_white(seq.load_image(indices[at])) * 255).round().astype(np.uint8)
+        for k, index in enumerate(shown):
+            rgb = (over_white(seq.load_image(index)) * 255).round().astype(np.uint8)
             strip.paste(Image.fromarray(rgb).resize((_SIDE, _SIDE), Image.Resampling.BOX), (k * _SIDE, 0))
     except InputError:
         return ""
