@@ -387,7 +387,8 @@ def check_sequence(seq: Sequence, path: Path) -> None:
             raise InputError(f"{path}: the camera of {name} is singular or not a rotation; correct it.")
         if not (v.fx > 0 and v.fy > 0 and np.isfinite([v.fx, v.fy, v.cx, v.cy]).all()):
             raise InputError(f"{path}: the focal length of {name} is not positive; correct it.")
-        for rel in filter(None, (v.image, v.passes)):
+        # Of others' pictures, frames of videos among them, their reader has made sure.
+        for rel in filter(None, (v.image, v.passes) if seq.picture is None else ()):
             _check_file(seq, path, folder, root, rel)
 
 

@@ -16,10 +16,13 @@ import numpy as np
 from ..sequence import FORMAT, InputError, Sequence, read_sequence
 from .colmap import model_folder, read_colmap
 from .dnerf import SPLITS, read_dnerf
+from .easymocap import PAIR, TABLES, camera_files, read_easymocap
+from .llff import FILE as LLFF
+from .llff import read_llff
 from .options import ReadOptions
 from .panoptic import SPLITS as META_SPLITS
 from .panoptic import read_panoptic
-from .posed import PosedScene, arrange, assemble
+from .posed import PosedScene, arrange, assemble, at_rate
 from .transforms import read_transforms
 
 OURS, DNERF, PANOPTIC = "transforms.json", "transforms_train.json", "train_meta.json"
@@ -42,11 +45,15 @@ def _colmap_files(folder: Path) -> list[Path]:
 TRANSFORMS = Layout(read_transforms, lambda folder: [folder / OURS])
 META = Layout(read_panoptic, lambda folder: [p for p in (folder / n for n in META_SPLITS) if p.is_file()])
 COLMAP = Layout(read_colmap, _colmap_files)
+MOCAP = Layout(read_easymocap, camera_files)
+POSES = Layout(read_llff, lambda folder: [folder / LLFF])
+LAYOUTS = "D-NeRF, nerfstudio, instant-ngp, COLMAP, Panoptic, EasyMocap, LLFF or Neu3D"
 
 
 def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
     """The Sequence in a folder, by what it holds: `transforms.json` of ours, or of nerfstudio or instant-ngp;
-    `transforms_train.json` of D-NeRF and NeRF's synthetic scenes; `train_meta.json` of Panoptic; COLMAP's tables.
+    `transforms_train.json` of D-NeRF and NeRF's synthetic scenes; `train_meta.json` of Panoptic; `intri.yml` and its
+    like of EasyMocap; `poses_bounds.npy` of LLFF and Neu3D; COLMAP's tables.
     options: what the user says of others' data. Raises InputError where there is none of these, and as `read_sequence`,
     `read_dnerf` and `assemble` do."""
     folder = Path(folder)
@@ -55,7 +62,7 @@ def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
         return copy.deepcopy(_assembled(folder.absolute(), stamps, options))
     told = [f"--{f.name}" for f in fields(options) if getattr(options, f.name) != f.default]
     ours = (folder / OURS).is_file()
-    told = [name for name in told if ours or name not in ("--background", "--axes")]
+    told = [name for name in told if ours or name not in ("--background", "--axes", "--fps")]
     if told and (ours or (folder / DNERF).is_file()):
         raise InputError(f"{folder}: {told[0]} is for layouts that leave it open; this one says it itself.")
     if ours:
@@ -63,8 +70,8 @@ def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
     if (folder / DNERF).is_file():
         return read_dnerf(folder, options)
     raise InputError(
-        f"{folder / OURS}: no such file, nor {DNERF}, {PANOPTIC} or COLMAP's sparse/0; give a folder that `timesplat "
-        "render` wrote, or one of D-NeRF, nerfstudio, instant-ngp, COLMAP or Panoptic."
+        f"{folder / OURS}: no such file, nor {DNERF}, {PANOPTIC}, {PAIR[0]}, {LLFF} or COLMAP's sparse/0; give a "
+        f"folder that `timesplat render` wrote, or one of {LAYOUTS}."
     )
 
 
@@ -72,7 +79,7 @@ def arranged(folder: Path, options: ReadOptions = DEFAULTS) -> tuple[Sequence, l
     """The Sequence in a folder before it is known where the object is, with the cameras' matrices (4,4) as they are
     written, and the convention that they are read in; None for ours, whose convention is known. Raises InputError."""
     if layout := _layout(Path(folder)):
-        scene = layout.read(Path(folder))
+        scene = at_rate(layout.read(Path(folder)), options.fps)
         return arrange(scene, options), [p.matrix for p in scene.pictures], options.axes or scene.axes
     if (Path(folder) / OURS).is_file() or not (Path(folder) / DNERF).is_file():
         return open_sequence(folder, options), None, "opengl"
@@ -96,6 +103,10 @@ def _layout(folder: Path) -> Layout | None:
         return None
     if (folder / PANOPTIC).is_file():
         return META
+    if (folder / LLFF).is_file():
+        return POSES
+    if camera_files(folder):
+        return MOCAP
     return COLMAP if model_folder(folder) else None
 
 
@@ -114,7 +125,8 @@ def sequences_in(root: Path) -> list[Path]:
     found = []
     for folder, below, files in os.walk(root):
         below[:] = [name for name in below if not name.startswith(".")]
-        if not {OURS, DNERF, PANOPTIC}.isdisjoint(files) or ({"sparse", "colmap"} & {*below} and _layout(Path(folder))):
+        sure, perhaps = {OURS, DNERF, PANOPTIC, LLFF}, {*PAIR, *TABLES}
+        if sure & {*files} or ((perhaps & {*files} or {"sparse", "colmap"} & {*below}) and _layout(Path(folder))):
             found.append(Path(folder))
             # What else lies below it is its own: a COLMAP project beside nerfstudio's file is the same pictures.
             below[:] = [name for name in below if name not in ("sparse", "colmap")]

@@ -55,8 +55,12 @@ def read_dnerf(folder: Path, options: ReadOptions = FOUND_OUT, normalised: bool 
         moving = any("time" in f for f in data["train"]["frames"])
         width, height = _size(folder, data["train"])
         times = {round(float(f["time"]), 6) for f in data["train"]["frames"]} if moving else {0.0}
-    seq = Sequence(width, height, FPS, 0, max(len(times) - 1, 0), root=folder, remedy=REMEDY)
-    seq.provenance = {"asset": folder.absolute().name, "format": "D-NeRF", "fps": f"not known, {FPS:g} assumed"}
+    seq = Sequence(width, height, options.fps or FPS, 0, max(len(times) - 1, 0), root=folder, remedy=REMEDY)
+    seq.provenance = {
+        "asset": folder.absolute().name,
+        "format": "D-NeRF",
+        "fps": "as --fps says" if options.fps else f"not known, {FPS:g} assumed",
+    }
     for split, d in data.items():
         with read_from(files[split], REMEDY):
             views = [_view(seq, split, n, d, f, moving) for n, f in enumerate(d["frames"])]

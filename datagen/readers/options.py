@@ -38,6 +38,7 @@ class ReadOptions:
     times: str | None = None  # a pattern for paths, see `times.of_names`, or none
     aabb: tuple[float, ...] | None = None  # x0 y0 z0 x1 y1 z1 of the volume, in the cameras' world
     scale: float | None = None  # half the volume's side, in the cameras' world, around what the cameras look at
+    fps: float | None = None  # moments a second: so many are taken of videos, so many pictures have
 
     def __post_init__(self) -> None:
         if self.axes is not None and self.axes not in AXES:
@@ -50,6 +51,8 @@ class ReadOptions:
                 raise InputError("--aabb: give x0 y0 z0 x1 y1 z1, each of the first three less than its like.")
         if self.scale is not None and not (np.isfinite(self.scale) and self.scale > 0):
             raise InputError(f"--scale {self.scale:g}: give more than 0.")
+        if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
+            raise InputError(f"--fps {self.fps:g}: give more than 0.")
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -64,6 +67,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
                        help="the volume that holds the object, in the cameras' world")  # fmt: skip
     group.add_argument("--scale", type=float, help="half the volume's side, in the cameras' world, around what they "
                        "look at")  # fmt: skip
+    group.add_argument("--fps", type=float, help="moments a second: so many frames are taken of videos (default: all), "
+                       "and so many pictures have whose rate nothing tells")  # fmt: skip
 
 
 def from_arguments(args: argparse.Namespace) -> ReadOptions:

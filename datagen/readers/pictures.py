@@ -15,9 +15,11 @@ import numpy as np
 from ..sequence import InputError, View
 from .backgrounds import Background, colour_of, common_colour, key_out
 from .lenses import Lens, straighten
+from .videos import read_frame
 
 ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")  # Pillow's modes with alpha
 MEASURED = 12  # pictures whose rims are measured
+PARTS = 31  # a mask without larger values holds numbers of parts, such as of a body, or 0 and 1
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,13 @@ class Source:
     mask: Path | None
     lens: Lens
     upright: bool = True
+    video_frame: int | None = None  # which one, where the image is a video
+
+    def read(self, remedy: str) -> np.ndarray:
+        """(H,W,4) uint8 as the lens took it, without its mask. Raises InputError naming the file."""
+        if self.video_frame is not None:
+            return read_frame(self.image, self.video_frame)
+        return read_picture(self.image, self.upright, remedy)
 
 
 class Pictures:
@@ -61,7 +70,7 @@ class Pictures:
         return shrunk(alpha, size)
 
     def _rgba(self, source: Source) -> np.ndarray:
-        rgba = read_picture(source.image, source.upright, self.remedy)
+        rgba = source.read(self.remedy)
         if source.mask:
             mask = read_mask(source.mask, self.remedy).astype(np.float32)
             rgba[..., 3] = np.rint(rgba[..., 3] * mask / 255)
@@ -122,7 +131,8 @@ def read_picture(path: Path, upright: bool, remedy: str) -> np.ndarray:
 
 
 def read_mask(path: Path, remedy: str) -> np.ndarray:
-    """(H,W) uint8, 255 where the object is; masks of 0 and 1 are taken for what they mean. Raises InputError."""
+    """(H,W) uint8, 255 where the object is; masks of 0 and 1, and of numbers of parts, are taken for what they mean.
+    Raises InputError."""
     from PIL import Image
 
     try:
@@ -133,7 +143,7 @@ def read_mask(path: Path, remedy: str) -> np.ndarray:
                 mask = np.array(im.getchannel("A") if im.mode in ALPHA else im.convert("L"))
     except Exception as e:
         raise InputError(f"{path}: the mask cannot be read ({e}); {remedy}.") from None
-    return mask * np.uint8(255) if mask.max(initial=0) == 1 else mask
+    return (mask > 0) * np.uint8(255) if mask.max(initial=0) <= PARTS else mask
 
 
 def size_of(path: Path, upright: bool, remedy: str) -> tuple[tuple[int, int], bool, bool]:
@@ -174,7 +184,7 @@ def background_of(
         found = colour_of(asked)
         return found, f"what is {found} and reaches the border is background, as --background says"
     chosen = [sources[i] for i in np.unique(np.linspace(0, len(sources) - 1, MEASURED).round().astype(int))]
-    if measured := common_colour(read_picture(s.image, s.upright, remedy)[..., :3] for s in chosen):
+    if measured := common_colour(s.read(remedy)[..., :3] for s in chosen):
         return measured, f"what is {measured} and reaches the border is background, as measured there"
     return None, (
         "no alpha, no masks, no constant colour behind the object: all that is seen counts as the object, and what "

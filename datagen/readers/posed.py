@@ -8,7 +8,7 @@ cameras in one convention, sizes, backgrounds, and the volume, found and not ass
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from .options import AXES, ReadOptions
 from .pictures import Pictures, Source, background_of, scaled_to, size_of
 from .placing import place
 from .times import clip_of, of_names
+from .videos import video_of
 
 REMEDY = "correct it, or get the data set again"
 
@@ -35,6 +36,12 @@ class Posed:
     camera: str | None = None
     rig: str = "train"
     mask: str | None = None
+    video_frame: int | None = None  # which one, where the image is a video; `image` is then PATH#FRAME
+
+    @property
+    def file(self) -> str:
+        """The path below the scene's folder of what holds it."""
+        return self.image if self.video_frame is None else self.image.rpartition("#")[0]
 
 
 @dataclass
@@ -62,8 +69,25 @@ def assemble(scene: PosedScene, options: ReadOptions) -> Sequence:
     return seq
 
 
+def at_rate(scene: PosedScene, fps: float | None) -> PosedScene:
+    """The scene at so many moments a second. Of videos frames are left out, the same of all; pictures have no rate of
+    their own that could be changed: theirs is what is said. Raises InputError for more than a video has."""
+    if fps is None or fps == scene.fps:
+        return scene
+    if scene.fps is None or all(p.video_frame is None for p in scene.pictures):
+        return replace(scene, fps=fps)
+    if fps > scene.fps:
+        raise InputError(f"--fps {fps:g}: the videos have {scene.fps:g} frames a second; give no more.")
+    last = max(p.video_frame or 0 for p in scene.pictures)
+    count = int((last + 0.5) * fps / scene.fps) + 1
+    moment = {round(m * scene.fps / fps): m for m in range(count)}
+    kept = [replace(p, frame=float(moment[p.video_frame])) for p in scene.pictures if p.video_frame in moment]
+    return replace(scene, fps=fps, pictures=kept, notes=[*scene.notes, f"{fps:g} of {scene.fps:g} frames a second"])
+
+
 def arrange(scene: PosedScene, options: ReadOptions) -> Sequence:
     """The same in the cameras' own world, before it is known where the object is. Raises InputError."""
+    scene = at_rate(scene, options.fps)
     if not scene.pictures:
         raise InputError(f"{scene.path}: it has no pictures; {REMEDY}.")
     sources, has_alpha, masked = _sources(scene)
@@ -100,12 +124,16 @@ def _sources(scene: PosedScene) -> tuple[dict[str, Source], bool, bool]:
     has_alpha = False
     root = scene.folder.resolve()
     for p in scene.pictures:
-        for name in filter(None, (p.image, p.mask)):
+        for name in filter(None, (p.file, p.mask)):
             if not (root / name).resolve().is_relative_to(root):
                 raise InputError(f"{scene.path}: {name} points outside of the folder; correct it.")
-        image = scene.folder / p.image
+        image = scene.folder / p.file
         stated = (p.lens.width, p.lens.height)
-        size, turned, alpha = size_of(image, True, REMEDY)
+        if p.video_frame is None:
+            size, turned, alpha = size_of(image, True, REMEDY)
+        else:
+            video = video_of(image)
+            size, turned, alpha = (video.width, video.height), False, False
         upright = scene.upright if scene.upright is not None else not (turned and size == stated[::-1] != stated)
         if turned and not upright:
             size = size[::-1]
@@ -126,7 +154,7 @@ def _sources(scene: PosedScene) -> tuple[dict[str, Source], bool, bool]:
                     "pictures' size."
                 )
         has_alpha |= alpha
-        sources[p.image] = Source(image, mask, lens, upright)
+        sources[p.image] = Source(image, mask, lens, upright, p.video_frame)
     return sources, has_alpha, any(s.mask for s in sources.values())
 
 
