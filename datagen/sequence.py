@@ -89,6 +89,7 @@ class Sequence:
     root: Path | None = None  # the folder it was read from
     remedy: str = "render the Sequence again"  # what to do where a file of it is missing or damaged
     picture: Callable[[View], np.ndarray] | None = None  # how a view's picture is read where its file is not yet RGBA
+    hull: Callable[[int], np.ndarray | None] | None = None  # where in a view without mask the object can be, (H,W) 0..255
 
     def unit_time(self, frame: float) -> float:
         """0..1 over the clip; 0 where the clip is one frame."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..datagen.readers import open_sequence
 from ..datagen.sequence import Sequence
-from ..model.views import Views, load_views
+from ..model.views import Views, load_views, shrink_factor
 from .flip import features
 
 
@@ -24,6 +24,7 @@ class Truth:
     views: Views
     picture: Tensor  # (V,H,W,3) over white
     novel: Tensor  # (V,) bool: no input shows it
+    inside: Tensor | None = None  # (V,H,W) 0..1 where pictures are compared; elsewhere both are white
     seen: dict[int, Tensor] = field(default_factory=dict)  # `flip.features` by view, made when asked for
 
     def features(self, i: int) -> Tensor:
@@ -35,9 +36,19 @@ class Truth:
 
 def load_truth(seq: Sequence, targets: Indices[int], novel: Indices[int], size: int | None = None) -> Truth:
     """The views `targets` at `size` pixels as truth; `novel` are those of them that no input shows. Light is averaged
-    where they are made smaller, so that laid on white before or after is the same."""
+    where they are made smaller, so that laid on white before or after is the same. Views without a mask, of a scene
+    with masks, are compared where the hull of the others' masks is, and nowhere else."""
     views, chosen = load_views(seq, targets, size=size), set(novel)
-    return Truth(views, views.over(), torch.tensor([i in chosen for i in targets]))
+    inside = None
+    if seq.hull is not None:
+        inside = torch.ones_like(views.alpha)
+        for n, i in enumerate(targets):
+            if (hull := seq.hull(i)) is not None:
+                by = shrink_factor(seq, size)
+                share = torch.from_numpy(hull.reshape(views.size[0], by, views.size[1], by)) / 255
+                inside[n] = share.mean((1, 3))
+        views = replace(views, alpha=views.alpha * inside)
+    return Truth(views, views.over(), torch.tensor([i in chosen for i in targets]), inside)
 
 
 def without_depth(views: Views) -> Views:

@@ -20,7 +20,7 @@ from ..model.parallel import work_clock
 from ..model.rasterize import render
 from ..model.rasterize.lifetime_index import QUICKER_FROM, LifetimeIndex
 from ..model.reconstruct import reconstruct_views
-from ..model.views import Views
+from ..model.views import BACKGROUND, Views
 from .loading import Truth
 from .method_spec import MethodSpec
 from .metrics import Pictures, measure, summarise
@@ -61,7 +61,11 @@ def draw(scene: Gaussians4D | ReconstructedScene, views: Views) -> tuple[Tensor,
 
 def score(scene: Gaussians4D | ReconstructedScene, truth: Truth, left_out: tuple[str, ...] = ()) -> dict[str, list]:
     """`metrics.measure` of the scene's pictures of the views of truth."""
-    return measure(Pictures(*draw(scene, truth.views), truth), left_out)
+    rgb, alpha = draw(scene, truth.views)
+    if truth.inside is not None:
+        share = truth.inside[..., None]
+        rgb, alpha = rgb * share + BACKGROUND * (1 - share), alpha * truth.inside
+    return measure(Pictures(rgb, alpha, truth), left_out)
 
 
 def evaluate_views(

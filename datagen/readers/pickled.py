@@ -45,6 +45,10 @@ def _scalar(kind: _Kind, data: bytes) -> Any:
     return np.frombuffer(data, kind.dtype())[0].item()
 
 
+def _whole(data: bytes, kind: _Kind, shape: tuple, order: Any) -> np.ndarray:
+    return np.frombuffer(data, kind.dtype()).reshape(shape, order="F" if order == "F" else "C")
+
+
 def _encode(text: str, _coding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
@@ -54,6 +58,7 @@ _STAND_INS = {
     "_reconstruct": lambda *_: _Array(),
     "ndarray": object,  # is passed to _reconstruct and not called
     "scalar": _scalar,
+    "_frombuffer": _whole,
     "encode": _encode,
 }
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..sequence import InputError, Sequence, View, check_sequence
+from .hulls import MaskHulls
 from .lenses import Lens
 from .options import AXES, ReadOptions
 from .pictures import Pictures, Source, background_of, scaled_to, size_of
@@ -66,6 +67,9 @@ def assemble(scene: PosedScene, options: ReadOptions) -> Sequence:
     the fault, see the tests of what is refused."""
     seq = arrange(scene, options)
     place(seq, scene.points, options, scene.path)
+    if any(p.mask for p in scene.pictures) and not all(p.mask for p in scene.pictures):
+        assert isinstance(seq.picture, Pictures)
+        seq.hull = MaskHulls(seq, seq.picture)
     return seq
 
 

@@ -40,7 +40,7 @@ def same_cameras(seq, films):
 def test_one_video_a_camera(folder, films):
     seq = open_sequence(folder)
     same_cameras(seq, films)
-    assert seq.provenance["format"] == "Neu3D" and sequences_in(folder.parent) == [folder]
+    assert seq.provenance["format"] == "Neu3D" and sequences_in(folder) == [folder]
     assert (seq.fps, seq.frame_start, seq.frame_end, len(seq.views)) == (30, 0, 4, 40)
     assert {v.camera for v in seq.views if v.rig == "target"} == {"cam00"} and len(seq.select(rig="train")) == 35
     for i in (0, 7, 39):
@@ -94,7 +94,7 @@ def test_damage_is_named(folder, films):
         (np.array([{"a": 1}], object), "it is damaged"),
     ):
         np.save(path, rows, allow_pickle=True)
-        with pytest.raises(InputError, match=rf"poses_bounds\.npy: {says}"):
+        with pytest.raises(InputError, match=rf"poses_bounds\.npy: .*{says}"):
             read_llff(folder)
     for p in folder.glob("*.mp4"):
         p.unlink()
