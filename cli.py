@@ -76,10 +76,10 @@ def _main(argv: list[str] | None) -> int:
 
 
 def inspect_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.readers import LAYOUTS
     from .datagen.readers.options import add_arguments
 
-    p.add_argument("folder", type=Path, help="pictures with cameras: a Sequence, or a folder of D-NeRF, nerfstudio, "
-                   "instant-ngp, COLMAP or Panoptic")  # fmt: skip
+    p.add_argument("folder", type=Path, help=f"pictures with cameras: a Sequence, or a folder of {LAYOUTS}")
     p.add_argument("--out", type=Path, help=".png to draw, of the cameras, the volume and the pictures over time "
                    "(default: inspect-FOLDER.png here)")  # fmt: skip
     add_arguments(p)
@@ -103,26 +103,30 @@ def inspect(args: argparse.Namespace) -> int:
 
 
 def import_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.readers import LAYOUTS
     from .datagen.readers.options import add_arguments
+    from .datagen.writers import layout_argument
 
-    p.add_argument("folder", type=Path, help="of D-NeRF, nerfstudio, instant-ngp, COLMAP or Panoptic")
-    p.add_argument("--out", type=Path, required=True, help="folder of the Sequence to write")
+    p.add_argument("folder", type=Path, help=f"a Sequence, or a folder of {LAYOUTS}")
+    p.add_argument("--out", type=Path, required=True, help="folder to write")
+    layout_argument(p)
     add_arguments(p)
 
 
 def import_(args: argparse.Namespace) -> int:
-    """Write others' pictures and cameras as a Sequence: one size, straight lines, alpha, a normalised world."""
-    from .datagen.importing import import_sequence
+    """Write others' pictures and cameras as a Sequence: one size, straight lines, alpha, a normalised world. Or, with
+    --layout, a Sequence (a render, a capture) or any of them as another program wants it."""
     from .datagen.inspection import counts
     from .datagen.readers import open_sequence
     from .datagen.readers.options import from_arguments
+    from .datagen.writers import write_layout
 
     seq = open_sequence(args.folder, from_arguments(args))
     for line in [counts(seq), *seq.provenance.get("read", [])[1:]]:
         print(line)
     with _bar() as progress:
-        written = import_sequence(seq, args.out, progress)
-    print(f"{args.out}: {len(written.views)} pictures")
+        write_layout(seq, args.out, args.layout, progress)
+    print(f"{args.out}: {len(seq.views)} pictures")
     return 0
 
 
@@ -191,10 +195,10 @@ def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
     from .model.fitting.quality import QUALITIES
 
     meanings = "; ".join(f"{n}: {q.size} pixels, {q.steps:,} steps, {q.gaussians:,}" for n, q in QUALITIES.items())
+    from .datagen.readers import LAYOUTS
     from .datagen.readers.options import add_arguments
 
-    p.add_argument("sequence", type=Path, help="folder that `timesplat render` wrote, or one of D-NeRF, nerfstudio, "
-                   "instant-ngp, COLMAP or Panoptic")  # fmt: skip
+    p.add_argument("sequence", type=Path, help=f"folder that `timesplat render` wrote, or one of {LAYOUTS}")
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
     add_arguments(p)
     p.add_argument("--method", help="tracks, lift, guided, deform, rgb, sweep, predicted, 4dgs (default: tracks "
@@ -434,8 +438,10 @@ def evaluate_arguments(p: argparse.ArgumentParser) -> None:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Render what is not yet rendered, reconstruct with each method, score, write tables in the paper's layout."""
+    from .datagen.readers.options import from_arguments
     from .evaluation.evaluate import EvaluateOptions, evaluate
 
+    args.reading = from_arguments(args)
     return evaluate(options_of(EvaluateOptions, args))
 
 
@@ -450,8 +456,10 @@ def bench(args: argparse.Namespace) -> int:
     on two cores. Writes into --out: bench.csv (a row for each object and method), bench.md (means, machine, what is
     on the Pareto frontiers) and bench-*.png and .svg: quality against seconds and against size, Gaussian budgets,
     numbers of views and sizes, renderer samples. A run that was stopped goes on where it was."""
+    from .datagen.readers.options import from_arguments
     from .evaluation.bench import BenchOptions, bench
 
+    args.reading = from_arguments(args)
     return bench(options_of(BenchOptions, args))
 
 

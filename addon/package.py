@@ -14,7 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ..datagen.sequence import InputError, move
+from ..datagen.sequence import InputError
+from ..datagen.whole_folders import move
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILDER = "scripts/addons_core/bl_pkg/cli/blender_ext.py"

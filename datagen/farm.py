@@ -268,6 +268,8 @@ def cores() -> list[int]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `timesplat render`."""
     defaults = RenderSettings()
+    from .writers import layout_argument
+
     parser.add_argument("assets", nargs="*", metavar="ASSET", help=f"files or folders: {' '.join(ASSET_SUFFIXES)}")
     parser.add_argument("--out", required=True, type=Path, help="folder for the Sequences")
     parser.add_argument("--root", type=Path, metavar="FOLDER", help="paths in files may lead below it, and names "
@@ -290,6 +292,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--displace", action="store_true", help="still objects, moved a little along a line")
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--device", default=defaults.device, choices=["CPU", "GPU"])
+    layout_argument(parser)
     parser.add_argument("--jobs", type=int, default=len(cores()), metavar="N", help="assets at a time (%(default)s)")
     parser.add_argument("--limit-seconds", type=float, default=3600.0, metavar="S", help="an asset that takes longer, "
                         "by the clock, is given up (%(default)g)")  # fmt: skip
@@ -308,6 +311,8 @@ def run(args: argparse.Namespace) -> int:
     if not assets:
         raise InputError("render: there is nothing to render; give an asset, a folder, or --zoo 0-9.")
     settings = RenderSettings(**{name: getattr(args, name) for name in asdict(RenderSettings())})
+    # In another layout they are not Sequences, from which a run that was stopped goes on: these are kept, hidden.
+    out = args.out if args.layout == "sequence" else args.out / ".sequences"
     limits = Limits(args.limit_seconds, args.limit_memory)
     licences = read_licences(args.licences) if args.licences else None
     with tqdm(total=0, unit="asset", disable=None) as bar:
@@ -321,7 +326,7 @@ def run(args: argparse.Namespace) -> int:
 
         folders, failures = render_assets(
             assets,
-            args.out,
+            out,
             settings,
             root=args.root,
             jobs=args.jobs,
@@ -331,9 +336,20 @@ def run(args: argparse.Namespace) -> int:
             report=report,
             progress=progress,
         )
+    for folder in folders if out != args.out else ():
+        _in_layout(folder, args.out / folder.relative_to(out), args.layout)
     failed = f", {len(failures)} failed (--retry tries them again)" if failures else ""
-    print(f"{len(folders)} sequences in {args.out}{failed}; {args.out / CSV} has them all")
+    print(f"{len(folders)} sequences in {args.out}{failed}; {out / CSV} has them all")
     return 2 if failures else 0
+
+
+def _in_layout(folder: Path, out: Path, layout: str) -> None:
+    """Writes a Sequence in a layout, unless that is done."""
+    from .writers import LAYOUTS, write_layout
+
+    mark, source = out / LAYOUTS[layout].mark, folder / "transforms.json"
+    if not mark.is_file() or mark.stat().st_mtime < source.stat().st_mtime:
+        write_layout(read_sequence(folder), out, layout)
 
 
 def parse_seeds(text: str | None) -> list[int]:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .readers import arranged, open_sequence, volume
+from .readers import arranged, volume
 from .readers.options import AXES, ReadOptions
-from .readers.placing import HELD_OUT, looked_at, shows_object, silhouettes_of
+from .readers.placing import HELD_OUT, looked_at, shows_object, silhouettes_of, small_masks
 from .sequence import InputError, Sequence, opengl_to_opencv
 
 FITS = 0.6  # the least share of the silhouettes that fit together where cameras are right
@@ -45,9 +45,10 @@ class Inspection:
 
 def inspect(folder: Path, options: ReadOptions) -> Inspection:
     """Raises InputError for what cannot be read at all; cameras that do not agree are told instead."""
-    world, matrices, stated = arranged(folder, options)
-    advice = None
-    fits = {} if matrices is None else readings(world, matrices)
+    found = arranged(folder, options)
+    world, stated, advice = found.world, found.axes, None
+    masks = small_masks(world) if shows_object(world) else None  # seconds for hundreds of pictures: once
+    fits = {} if found.matrices is None or masks is None else readings(world, found.matrices, masks)
     best = max(fits, key=lambda a: fits[a], default=stated)
     if fits and best != stated and fits[best] > max(FITS, fits[stated] + BETTER):
         advice = (
@@ -55,7 +56,7 @@ def inspect(folder: Path, options: ReadOptions) -> Inspection:
             f"pass --axes {best}"
         )
     try:
-        seq, placed = open_sequence(folder, options), True
+        seq, placed = found.place(masks), True
     except InputError:
         if advice is None:
             raise
@@ -63,9 +64,9 @@ def inspect(folder: Path, options: ReadOptions) -> Inspection:
     return Inspection(
         seq,
         counts(seq),
-        agreement(seq),
+        agreement(seq, masks),
         advice,
-        [*(lying(seq) if placed else []), *repeated(seq), *gaps(seq), *light(seq)],
+        [*(lying(seq) if placed and advice is None else []), *repeated(seq), *gaps(seq), *light(seq)],
         placed,
     )
 
@@ -81,10 +82,11 @@ def counts(seq: Sequence) -> str:
     return f"{what}, {seq.width}x{seq.height} pixels" + f"; {held} are held out" * bool(held)
 
 
-def agreement(seq: Sequence) -> str:
-    """Whether the cameras look at one object, and which sides they see."""
+def agreement(seq: Sequence, masks: np.ndarray | None) -> str:
+    """Whether the cameras look at one object, and which sides they see. masks: `small_masks`, None where nothing tells
+    the object."""
     around = f"they see {coverage(seq):.0%} of its sides"
-    if not shows_object(seq):
+    if masks is None:
         place = np.array([v.c2w[:3, 3] for v in seq.views])
         axis = np.array([-v.c2w[:3, 2] for v in seq.views])
         met = volume.common_point(place, axis)
@@ -95,7 +97,7 @@ def agreement(seq: Sequence) -> str:
         return (
             f"{front:.0%} of the cameras look at one place, their axes pass it at {off:.0%} of its distance; {around}"
         )
-    sil = silhouettes_of(seq)
+    sil = silhouettes_of(seq, masks)
     if not sil.masks.any():
         return "no picture shows anything of an object"
     box = volume.box_of(sil)
@@ -119,13 +121,11 @@ def _miss(place: np.ndarray, direction: np.ndarray, point: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(np.cross(point - place, direction), axis=1)))
 
 
-def readings(seq: Sequence, matrices: list[np.ndarray]) -> dict[str, float]:
-    """How well the silhouettes fit together, 0..1, in every reading of the cameras' axes; none where nothing tells the
-    object. matrices: (4,4) as they are written, of each view."""
-    if not shows_object(seq):
-        return {}
+def readings(seq: Sequence, matrices: list[np.ndarray], masks: np.ndarray) -> dict[str, float]:
+    """How well the silhouettes fit together, 0..1, in every reading of the cameras' axes; none where they are empty.
+    matrices: (4,4) as they are written, of each view; masks: `small_masks`."""
     views, _ = looked_at(seq)
-    sil = silhouettes_of(seq)
+    sil = silhouettes_of(seq, masks)
     if not sil.masks.any():
         return {}
     out = {}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A Sequence: images of an object with the camera and the moment of each, as a folder anyone can read.
 
-The layout is the one of NeRF and D-NeRF datasets (`transforms.json`, `images/`, `passes/`), so that
-other programs read it as it is. What others wrote comes by `readers`. numpy only: neither bpy nor torch is needed here.
+`transforms.json`, `images/`, `passes/`. What others wrote comes by `readers`; `writers` make of it what other programs
+read as it is. numpy only: neither bpy nor torch is needed here.
 
 Conventions
     world       right-handed, Z up; positions are normalised: the object's box over the whole clip is centred at
@@ -18,10 +18,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
-import secrets
-import shutil
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -31,6 +27,7 @@ import numpy as np
 from .errors import InputError
 from .passes import Passes, read_passes
 from .track_file import SurfaceTracks, read_tracks
+from .whole_folders import whole_folder
 
 FORMAT = "timesplat-sequence-1"
 
@@ -89,7 +86,9 @@ class Sequence:
     root: Path | None = None  # the folder it was read from
     remedy: str = "render the Sequence again"  # what to do where a file of it is missing or damaged
     picture: Callable[[View], np.ndarray] | None = None  # how a view's picture is read where its file is not yet RGBA
-    hull: Callable[[int], np.ndarray | None] | None = None  # where in a view without mask the object can be, (H,W) 0..255
+    hull: Callable[[int], np.ndarray | None] | None = (
+        None  # where in a view without mask the object can be, (H,W) 0..255
+    )
 
     def unit_time(self, frame: float) -> float:
         """0..1 over the clip; 0 where the clip is one frame."""
@@ -187,19 +186,6 @@ def focal_from_fov(fov_degrees: float, size: int) -> float:
 
 # ---------------------------------------------------------------- the folder
 
-WINDOWS = os.name == "nt"
-_PAUSES_BEFORE_RETRY = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # seconds, see `move`
-
-
-def move(source: str | Path, target: str | Path) -> None:
-    """os.replace, within a disk. On Windows nothing can be moved while a program has it open, and a virus scanner opens
-    what is new for a moment: there it is tried again for some seconds. Raises OSError."""
-    for pause in _PAUSES_BEFORE_RETRY if WINDOWS else ():
-        with contextlib.suppress(PermissionError):
-            return os.replace(source, target)
-        time.sleep(pause)
-    os.replace(source, target)
-
 
 def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) -> Sequence:
     """Writes a Sequence so that it appears whole or not at all.
@@ -210,32 +196,9 @@ def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) ->
     stays behind.
     """
     folder = Path(folder)
-    if (
-        folder.exists()
-        and not (folder / "transforms.json").is_file()
-        and (not folder.is_dir() or any(folder.iterdir()))
-    ):
-        raise InputError(f"{folder}: it exists and is not a Sequence; it is not overwritten, give another name.")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    # Not by `tempfile`, whose folders belong to this user alone, on Windows for good.
-    tmp = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
-    tmp.mkdir()
-    old = tmp.with_name(f"{tmp.name}.old")
-    try:
+    with whole_folder(folder, "transforms.json", "a Sequence") as tmp:
         fill(tmp)
         (tmp / "transforms.json").write_text(json.dumps(_to_json(seq), indent=1))
-        if folder.exists():
-            move(folder, old)
-        try:
-            move(tmp, folder)
-        except BaseException:
-            if old.exists():
-                move(old, folder)
-            raise
-    except BaseException:
-        shutil.rmtree(tmp, ignore_errors=True)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
     return read_sequence(folder)
 
 

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from importlib.util import find_spec
 from pathlib import Path
 
 from tqdm import tqdm
 
+from ..datagen.readers import DEFAULTS, ReadOptions
+from ..datagen.readers.options import add_arguments as add_reading
 from ..datagen.sequence import InputError, Sequence
 
 # No checkpoint was trained on these seeds, and nothing was tuned on them.
@@ -62,6 +64,7 @@ class BenchOptions:
     limit: float | None = None
     device: str = "cpu"
     draw: Path | None = None
+    reading: ReadOptions = DEFAULTS  # what is said of others' folders
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -84,6 +87,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
                    "all objects have, and the same command goes on")  # fmt: skip
     p.add_argument("--device", default=d.device, help="where methods run: cpu or cuda (default: %(default)s)")
     p.add_argument("--draw", type=Path, metavar="CSV", help="only draw again, from a bench.csv")
+    add_reading(p)
 
 
 def bench(options: BenchOptions) -> int:
@@ -128,13 +132,14 @@ def measure(options: BenchOptions, started: float) -> list[str]:
     from .cache import Cache
     from .method_spec import parse_specs
     from .provenance import Provenance, machine, versions
-    from .runner import Conditions, run_all
+    from .runner import Conditions, run_all, told_of
 
     check_device(options.device)
     chosen = [m.label for m in parse_specs(options.methods)] if options.methods else None
     number = options.objects or (2 if options.quick else None)
     cache, settings = Cache(options.out), RenderSettings(rig="evaluation", targets=1, size=options.size)
-    sequences, failures = cache.sequences(options.assets or list(HELD_OUT[:number]), settings, options.jobs)
+    assets = options.assets or list(HELD_OUT[:number])
+    sequences, failures = cache.sequences(assets, settings, options.jobs, options.reading)
     sequences = dict(list(sequences.items())[:number])
     if not sequences:
         raise InputError(f"{options.assets[0]}: nothing to measure; none of the assets could be rendered.")
@@ -145,7 +150,8 @@ def measure(options: BenchOptions, started: float) -> list[str]:
     how = Conditions(
         costs=True, one_thread=True, device=options.device, jobs=options.jobs, started=started, deadline=deadline
     )
-    rows = run_all(runs_of(sequences, points), cache, how, "measuring")
+    runs = [replace(r, reading=told_of(sequences[r.object], options.reading)) for r in runs_of(sequences, points)]
+    rows = run_all(runs, cache, how, "measuring")
     if not rows:
         raise InputError(f"{options.out}: nothing was measured in the time given; allow more.")
     order = {(p.label, p.setup, p.size): i for i, p in enumerate(points)}

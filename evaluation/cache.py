@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from tqdm import tqdm
 
 from ..datagen.farm import render_assets
-from ..datagen.readers import name_of, open_sequence, sequences_in
+from ..datagen.readers import DEFAULTS, ReadOptions, name_of, open_sequence, sequences_in
 from ..datagen.render_job import RenderSettings
 from ..datagen.sequence import Sequence
 from ..model.gaussians import FIELDS, Gaussians4D, ReconstructedScene
@@ -32,11 +32,11 @@ class Cache:
     # ---------------------------------------------------------------- Sequences
 
     def sequences(
-        self, assets: list[str], settings: RenderSettings, jobs: int
+        self, assets: list[str], settings: RenderSettings, jobs: int, reading: ReadOptions = DEFAULTS
     ) -> tuple[dict[str, Sequence], list[str]]:
         """Of files and folders: the finished Sequences in them, and those of assets, rendered where they are not yet,
-        by name; and one sentence for each asset that failed."""
-        found, others = find_sequences(assets)
+        by name; and one sentence for each asset that failed. reading: what the user says of what is found."""
+        found, others = find_sequences(assets, reading)
         if not others:
             return found, []
         with tqdm(total=0, desc="rendering", unit="object", disable=None) as bar:
@@ -114,14 +114,14 @@ class Cache:
         return self.folder / "scenes" / f"{key}.safetensors"
 
 
-def find_sequences(assets: list[str]) -> tuple[dict[str, Sequence], list[str]]:
+def find_sequences(assets: list[str], reading: ReadOptions = DEFAULTS) -> tuple[dict[str, Sequence], list[str]]:
     """Of files and folders: the finished Sequences in them by name, and those that hold none and are to be rendered."""
     folders, others = [], []
     for asset in assets:
         found = sequences_in(Path(asset))
         folders += found
         others += [] if found else [asset]
-    return {n: open_sequence(f) for n, f in name_sequences(folders).items()}, others
+    return {n: open_sequence(f, reading) for n, f in name_sequences(folders).items()}, others
 
 
 def name_sequences(folders: list[Path]) -> dict[str, Path]:

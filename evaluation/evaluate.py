@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..datagen.readers import DEFAULTS, ReadOptions
+from ..datagen.readers.options import add_arguments as add_reading
 from ..datagen.rigs import SETUPS
 from ..datagen.sequence import InputError, Sequence
 from . import protocol
@@ -43,6 +45,7 @@ class EvaluateOptions:
     lpips: bool = True
     seed: int = 0
     device: str = "cpu"
+    reading: ReadOptions = DEFAULTS  # what is said of others' folders
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -76,6 +79,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--no-lpips", dest="lpips", action="store_false", help="leave LPIPS out even if it has weights")
     p.add_argument("--device", default=d.device, help="where methods run: cpu or cuda (default: %(default)s)")
     p.add_argument("--seed", type=int, default=d.seed)
+    add_reading(p)
 
 
 def evaluate(options: EvaluateOptions) -> int:
@@ -100,8 +104,8 @@ def evaluate(options: EvaluateOptions) -> int:
     rig = "evaluation" if several or setups[0] not in SETUPS else setups[0]
     settings = RenderSettings(rig=rig, targets=1, size=max(sizes), samples=options.samples, seed=options.seed)
 
-    cache, rendered = Cache(options.out), bool(find_sequences(options.assets)[0])
-    sequences, failures = cache.sequences(options.assets, settings, options.jobs)
+    cache, rendered = Cache(options.out), bool(find_sequences(options.assets, options.reading)[0])
+    sequences, failures = cache.sequences(options.assets, settings, options.jobs, options.reading)
     if not sequences:
         raise InputError(f"{options.assets[0]}: nothing to evaluate; none of the assets could be rendered.")
     if options.lpips and not find_lpips():
@@ -112,7 +116,8 @@ def evaluate(options: EvaluateOptions) -> int:
         jobs=min(options.jobs, len(setups) * len(sequences)) if several or rendered else 1,
         deadline=time.time() + options.limit if options.limit is not None else float("inf"),
     )
-    rows = run_all(plan(sequences, methods, setups, sizes, options.split), cache, conditions)
+    runs = plan(sequences, methods, setups, sizes, options.split, options.reading)
+    rows = run_all(runs, cache, conditions)
     if not rows:
         raise InputError(f"{options.out}: nothing was scored in the time given; allow more.")
     metrics = gather(rows, Provenance.of(options.command, [m.weights for m in methods]))
@@ -127,11 +132,12 @@ def plan(
     setups: list[str],
     sizes: dict[int, int],
     split: str = "test",
+    reading: ReadOptions = DEFAULTS,
 ) -> list[Run]:
     """Every method on every Sequence {name: Sequence} in every setup ("" for all views that are not held out) at every
-    size {pixels: score every n-th frame}; split: the held-out views that the setup "split" scores. Raises InputError
-    where views are missing."""
-    from .runner import Run
+    size {pixels: score every n-th frame}; split: the held-out views that the setup "split" scores; reading: what was
+    said of others' folders. Raises InputError where views are missing."""
+    from .runner import Run, told_of
 
     runs = []
     for setup in setups:
@@ -142,7 +148,8 @@ def plan(
                 targets = [i for i in scored if protocol.is_scored(seq, i, stride)]
                 labels = {"setup": setup, "stride": stride}
                 at = (tuple(inputs), tuple(targets), size, labels)
-                runs += [Run(name, seq.folder, m, *at) for m in methods if (m.method, setup) not in NOT_FOR]
+                able = [m for m in methods if (m.method, setup) not in NOT_FOR]
+                runs += [Run(name, seq.folder, m, *at, reading=told_of(seq, reading)) for m in able]
     return runs
 
 

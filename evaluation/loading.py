@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..datagen.readers import open_sequence
+from ..datagen.readers import DEFAULTS, ReadOptions, open_sequence
 from ..datagen.sequence import Sequence
 from ..model.views import Views, load_views, shrink_factor
 from .flip import features
@@ -73,12 +73,16 @@ def thinned(views: Views, step: int) -> Views:
 
 
 @lru_cache(maxsize=2)
-def kept_inputs(folder: Path, indices: tuple[int, ...], has_depth: bool, size: int) -> Views:
+def kept_inputs(
+    folder: Path, indices: tuple[int, ...], has_depth: bool, size: int, reading: ReadOptions = DEFAULTS
+) -> Views:
     """`load_views` of the Sequence in a folder; the last two are kept, for methods come one after another on them."""
-    return load_views(open_sequence(folder), indices, has_depth, size)
+    return load_views(open_sequence(folder, reading), indices, has_depth, size)
 
 
 @lru_cache(maxsize=4)
-def kept_truth(folder: Path, targets: tuple[int, ...], novel: tuple[int, ...], size: int) -> Truth:
+def kept_truth(
+    folder: Path, targets: tuple[int, ...], novel: tuple[int, ...], size: int, reading: ReadOptions = DEFAULTS
+) -> Truth:
     """`load_truth` of the Sequence in a folder; the last four are kept."""
-    return load_truth(open_sequence(folder), targets, novel, size)
+    return load_truth(open_sequence(folder, reading), targets, novel, size)

@@ -20,7 +20,8 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ..datagen.readers import described_by, open_sequence
+from ..datagen.readers import DEFAULTS, ReadOptions, described_by, open_sequence
+from ..datagen.sequence import Sequence
 from ..model.views import load_views
 from . import protocol
 from .cache import Cache
@@ -45,6 +46,12 @@ class Run:
     labels: dict = field(default_factory=dict, compare=False)  # what tables group the row by
     still: bool = False  # all times collapsed to 0
     step: int = 1  # the inputs are of every step-th frame, and make a clip of their own
+    reading: ReadOptions = DEFAULTS  # what the user said of the folder
+
+
+def told_of(seq: Sequence, reading: ReadOptions) -> ReadOptions:
+    """What the user said of others' folders, where a Sequence is of these: what was rendered says all of it itself."""
+    return reading if "read" in seq.provenance else DEFAULTS
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,7 @@ def key_of(run: Run, conditions: Conditions) -> str:
     """Names a row by all that has a say in it but the code: start with another folder after changing that."""
     how = (run.inputs, run.targets, run.size, run.still, run.step, conditions.left_out, conditions.device)
     parts = [_sequence_hash(run.folder), run.method.fingerprint, repr(how), str(conditions.costs)]
+    parts += [repr(run.reading)] if run.reading != DEFAULTS else []  # rows of before know no such options
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:20]
 
 
@@ -146,12 +154,12 @@ def _work(job: tuple[str, Run]) -> dict | None:
 def score_run(run: Run, conditions: Conditions, cache: Cache, key: str, load_depth: bool) -> dict:
     """`evaluate_views` of a run, with `costs` where they are asked for; its scene is kept where that is. load_depth:
     whether other runs will want the depth of the same views."""
-    seq = open_sequence(run.folder)
+    seq = open_sequence(run.folder, run.reading)
     load_depth = load_depth and all(seq.views[i].passes for i in run.inputs)
-    views = kept_inputs(run.folder, run.inputs, load_depth or run.method.has_depth, run.size)
+    views = kept_inputs(run.folder, run.inputs, load_depth or run.method.has_depth, run.size, run.reading)
     views = thinned(views if run.method.has_depth else without_depth(views), run.step)
     novel = tuple(protocol.novel(seq, list(run.inputs), list(run.targets)))
-    truth = kept_truth(run.folder, run.targets, novel, run.size)
+    truth = kept_truth(run.folder, run.targets, novel, run.size, run.reading)
     if run.still:
         views, truth = collapsed(views), replace(truth, views=collapsed(truth.views))
     row, scene = evaluate_views(views, run.method, truth, conditions.device, conditions.left_out)
@@ -166,7 +174,7 @@ def warm_up(run: Run, methods: list[MethodSpec], device: str = "cpu") -> None:
     """Every kind of method once on two views of a run, so that no timing holds the compilation of kernels (about
     fifteen seconds, the first time on a machine) or imports."""
     kinds = {(m.method, m.checkpoint, bool(m.refine), bool(m.counted), bool(m.budget)): m for m in methods}
-    seq = open_sequence(run.folder)
+    seq = open_sequence(run.folder, run.reading)
     for method in kinds.values():
         views = load_views(seq, run.inputs[:2], method.has_depth, run.size)
         brief = replace(method, refine=method.refine and WARM_UP_SECONDS, seconds=WARM_UP_SECONDS)

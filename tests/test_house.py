@@ -65,6 +65,7 @@ LAYERS = {
     ),
     "datagen": (
         ("datagen.errors", "datagen.image_files", "datagen.rigs", "datagen.track_file", "datagen.objaverse"),
+        ("datagen.whole_folders",),
         ("datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
         ("datagen.sequence",),
         ("datagen.readers",),
@@ -72,6 +73,7 @@ LAYERS = {
         ("datagen.curation.duplicates", "datagen.curation.decisions"),
         ("datagen.curation.page",),
         ("datagen.inspection", "datagen.importing", "datagen.curation"),
+        ("datagen.writers",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.licences", "datagen.render_index"),
         ("datagen.render_setup", "datagen.tracks", "datagen.render_child"),
@@ -100,6 +102,7 @@ MODEL_READS = {
     "datagen.rigs",
     "datagen.sequence",
     "datagen.track_file",
+    "datagen.whole_folders",
 }
 # What the product, all of `model` but these, does not know; they may use every layer up to the one named.
 ASIDE = {"model.baselines": "model.methods", "model.training": "model.inference"}

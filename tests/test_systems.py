@@ -15,10 +15,11 @@ import pytest
 from timesplat.addon import package
 from timesplat.addon.runtime import child_process as process
 from timesplat.addon.runtime import install as runtime
-from timesplat.datagen import render_asset, sequence
+from timesplat.datagen import render_asset, whole_folders
 from timesplat.datagen.farm import render_assets
 from timesplat.datagen.render_job import RenderSettings
-from timesplat.datagen.sequence import InputError, move, read_sequence
+from timesplat.datagen.sequence import InputError, read_sequence
+from timesplat.datagen.whole_folders import move
 from timesplat.model.io import atomic, usd_apart
 from timesplat.model.io.ply import write_ply
 
@@ -29,9 +30,9 @@ from .datagen.test_sequence import make as make_sequence
 @pytest.fixture
 def windows(monkeypatch):
     """The modules believe that they run on Windows; a pause takes no time."""
-    for module in (sequence, atomic, process):
+    for module in (whole_folders, atomic, process):
         monkeypatch.setattr(module, "WINDOWS", True)
-    monkeypatch.setattr(sequence.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(whole_folders.time, "sleep", lambda seconds: None)
 
 
 @pytest.fixture
@@ -61,7 +62,7 @@ def test_a_scanner_holds_a_new_file_for_a_moment(tmp_path, windows, held):
 
 
 def test_elsewhere_nobody_is_waited_for(tmp_path, held, monkeypatch):
-    monkeypatch.setattr(sequence, "WINDOWS", False)
+    monkeypatch.setattr(whole_folders, "WINDOWS", False)
     held(tmp_path / "b", 1)
     with pytest.raises(PermissionError):
         move(tmp_path / "a", tmp_path / "b")
@@ -96,7 +97,7 @@ def test_a_sequence_that_cannot_be_put_in_place_leaves_the_old(tmp_path, monkeyp
         real(source, target)
 
     monkeypatch.setattr(os, "replace", replace)
-    monkeypatch.setattr(sequence, "WINDOWS", False)
+    monkeypatch.setattr(whole_folders, "WINDOWS", False)
     with pytest.raises(PermissionError):
         make_sequence(folder, frames=2)
     assert len(read_sequence(folder).views) == 3 and os.listdir(tmp_path) == ["a"]
@@ -112,7 +113,7 @@ def test_a_sequence_is_open_to_those_to_whom_new_folders_are(tmp_path):
 
 
 def test_no_temporary_folder_fails_because_a_scanner_holds_a_file_in_it():
-    calls, root = [], Path(sequence.__file__).parent.parent
+    calls, root = [], Path(whole_folders.__file__).parent.parent
     for file in [root / "cli.py", *(f for d in ("addon", "datagen", "model") for f in (root / d).rglob("*.py"))]:
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "tempfile.TemporaryDirectory":

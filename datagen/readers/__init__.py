@@ -22,7 +22,7 @@ from .llff import read_llff
 from .options import ReadOptions
 from .panoptic import SPLITS as META_SPLITS
 from .panoptic import read_panoptic
-from .posed import PosedScene, arrange, assemble, at_rate
+from .posed import PosedScene, arrange, assemble, at_rate, placed
 from .transforms import read_transforms
 
 OURS, DNERF, PANOPTIC = "transforms.json", "transforms_train.json", "train_meta.json"
@@ -75,16 +75,30 @@ def open_sequence(folder: Path, options: ReadOptions = DEFAULTS) -> Sequence:
     )
 
 
-def arranged(folder: Path, options: ReadOptions = DEFAULTS) -> tuple[Sequence, list[np.ndarray] | None, str]:
-    """The Sequence in a folder before it is known where the object is, with the cameras' matrices (4,4) as they are
-    written, and the convention that they are read in; None for ours, whose convention is known. Raises InputError."""
-    if layout := _layout(Path(folder)):
-        scene = at_rate(layout.read(Path(folder)), options.fps)
-        return arrange(scene, options), [p.matrix for p in scene.pictures], options.axes or scene.axes
-    if (Path(folder) / OURS).is_file() or not (Path(folder) / DNERF).is_file():
-        return open_sequence(folder, options), None, "opengl"
-    seq = read_dnerf(Path(folder), options, normalised=False)
-    return seq, None if options.axes else [v.c2w for v in seq.views], options.axes or "opengl"
+@dataclass(frozen=True)
+class Arranged:
+    """The Sequence in a folder before it is known where the object is."""
+
+    world: Sequence
+    matrices: list[np.ndarray] | None  # (4,4) the cameras' as they are written; None where their convention is known
+    axes: str  # the convention that they are read in
+    place: Callable[[np.ndarray | None], Sequence]  # the same as `open_sequence`, of `small_masks` that are known
+
+
+def arranged(folder: Path, options: ReadOptions = DEFAULTS) -> Arranged:
+    """Raises InputError."""
+    folder = Path(folder)
+    if layout := _layout(folder):
+        scene = at_rate(layout.read(folder), options.fps)
+        world, axes = arrange(scene, options), options.axes or scene.axes
+        matrices = [p.matrix for p in scene.pictures]
+        return Arranged(world, matrices, axes, lambda masks: placed(copy.deepcopy(world), scene, options, masks))
+    if (folder / OURS).is_file() or not (folder / DNERF).is_file():
+        seq = open_sequence(folder, options)
+        return Arranged(seq, None, "opengl", lambda masks: seq)
+    seq = read_dnerf(folder, options, normalised=False)
+    written = None if options.axes else [v.c2w for v in seq.views]
+    return Arranged(seq, written, options.axes or "opengl", lambda masks: read_dnerf(folder, options))
 
 
 @lru_cache(maxsize=8)
@@ -128,8 +142,8 @@ def sequences_in(root: Path) -> list[Path]:
         sure, perhaps = {OURS, DNERF, PANOPTIC, LLFF}, {*PAIR, *TABLES}
         if sure & {*files} or ((perhaps & {*files} or {"sparse", "colmap"} & {*below}) and _layout(Path(folder))):
             found.append(Path(folder))
-            # What else lies below it is its own: a COLMAP project beside nerfstudio's file is the same pictures.
-            below[:] = [name for name in below if name not in ("sparse", "colmap")]
+            # What else lies below others' is their own: a COLMAP project beside nerfstudio's file is the same pictures.
+            below[:] = [] if _layout(Path(folder)) else [n for n in below if n not in ("sparse", "colmap")]
     return sorted(found)
 
 

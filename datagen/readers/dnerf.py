@@ -61,12 +61,16 @@ def read_dnerf(folder: Path, options: ReadOptions = FOUND_OUT, normalised: bool 
         "format": "D-NeRF",
         "fps": "as --fps says" if options.fps else f"not known, {FPS:g} assumed",
     }
+    # What several files list is of the first of these; ours does so where a split would be empty.
+    owner = {f["file_path"]: s for s in ("val", "test", "train") if s in data for f in data[s]["frames"]}
     for split, d in data.items():
         with read_from(files[split], REMEDY):
+            d["frames"] = [f for f in d["frames"] if owner[f["file_path"]] == split]
             views = [_view(seq, split, n, d, f, moving) for n, f in enumerate(d["frames"])]
             for v in views:
                 v.c2w = AXES[options.axes or "opengl"](v.c2w)
-        check_sequence(replace(seq, views=views), files[split])
+        if views:
+            check_sequence(replace(seq, views=views), files[split])
         seq.views += views
     if normalised:
         seq.normalisation = normalisation_of([v for v in seq.views if v.rig == "train"], width, height, files["train"])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where in a picture without a mask the object can be: the hull of other pictures' masks of the same moment.
 
-What is held out often has no mask, as in Panoptic, and what stands around the object is not reconstructed. The cells of a
-grid that the masks of the moment's other cameras leave are halved, again and again, and drawn into the picture; what
-is outside of them is background, of truth and of prediction alike.
+What is held out often has no mask, as in Panoptic, and what stands around the object is not reconstructed. The cells
+of a grid that the masks of the moment's other cameras leave are halved, again and again, and drawn into the picture;
+what is outside of them is background, of truth and of prediction alike.
 """
 
 from __future__ import annotations
@@ -95,9 +95,7 @@ class MaskHulls:
         return (count.cumsum(0).cumsum(1)[:-1, :-1] > 0) * np.uint8(255)
 
 
-def _any_within(
-    mask: np.ndarray, x: np.ndarray, y: np.ndarray, reach: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _any_within(mask: np.ndarray, x: np.ndarray, y: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P,) bool: whether squares of `reach` (P,) around places x, y (P,) in pixels touch a mask's picture (H,W), and
     whether any pixel in them is inside the mask; what lies beyond the picture's border counts as inside."""
     height, width = mask.shape

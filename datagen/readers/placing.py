@@ -18,11 +18,14 @@ UNIT = [[-1, -1, -1], [1, 1, 1]]
 DOUBTFUL = 0.7  # the least share of the silhouettes that should fit together
 
 
-def place(seq: Sequence, points: np.ndarray | None, options: ReadOptions, path: Path) -> None:
+def place(
+    seq: Sequence, points: np.ndarray | None, options: ReadOptions, path: Path, masks: np.ndarray | None = None
+) -> None:
     """Normalises a Sequence whose views are in the cameras' own world, and says how in `provenance["read"]`. points
-    (P,3): what is known of its surface. Raises InputError naming `path` where no picture shows anything, and where the
-    silhouettes, or without any the cameras, have no place in common."""
-    norm, how, box = _found(seq, points, options, path)
+    (P,3): what is known of its surface; masks: its `small_masks`, where they are known already. Raises InputError
+    naming `path` where no picture shows anything, and where the silhouettes, or without any the cameras, have no place
+    in common."""
+    norm, how, box = _found(seq, points, options, path, masks)
     seq.normalisation, t = norm, np.array(norm.translation)
     seq.aabb = UNIT if box is None else [((x - t) / norm.scale).tolist() for x in box]
     for v in seq.views:
@@ -45,10 +48,15 @@ def looked_at(seq: Sequence) -> tuple[list[int], NDArray[np.integer]]:
     return [inputs[k] for window in windows for k in window], number
 
 
-def silhouettes_of(seq: Sequence) -> volume.Silhouettes:
-    """Small masks of the views that are `looked_at`. Raises InputError for a picture that cannot be read."""
+def small_masks(seq: Sequence) -> np.ndarray:
+    """(V,h,w) bool of the views that are `looked_at`. Raises InputError for a picture that cannot be read."""
+    return np.stack([_alpha(seq, i) > 0.5 for i in looked_at(seq)[0]])
+
+
+def silhouettes_of(seq: Sequence, masks: np.ndarray | None = None) -> volume.Silhouettes:
+    """The `small_masks` of a Sequence, which are read where they are not given, with its cameras. Raises InputError."""
     views, window = looked_at(seq)
-    masks = np.stack([_alpha(seq, i) > 0.5 for i in views])
+    masks = small_masks(seq) if masks is None else masks
     return volume.Silhouettes(masks, *small_cameras(seq, views, masks.shape[2], masks.shape[1]), window)
 
 
@@ -69,14 +77,14 @@ def _alpha(seq: Sequence, index: int) -> np.ndarray:
 
 
 def _found(
-    seq: Sequence, points: np.ndarray | None, options: ReadOptions, path: Path
+    seq: Sequence, points: np.ndarray | None, options: ReadOptions, path: Path, known: np.ndarray | None
 ) -> tuple[Normalisation, str, tuple[np.ndarray, np.ndarray] | None]:
     """What leads from the unit box to the cameras' world, how it was found, and the object's box there, if known."""
     if options.aabb:
         low, high = np.array(options.aabb[:3]), np.array(options.aabb[3:])
         return volume.normalisation_around(low, high), "the box that --aabb says", (low, high)
     if shows_object(seq):
-        sil = silhouettes_of(seq)
+        sil = silhouettes_of(seq, known)
         if not sil.masks.any():
             raise InputError(f"{path}: no picture shows anything of an object; check masks and background.")
         box = volume.box_of(sil)

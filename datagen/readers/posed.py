@@ -65,8 +65,12 @@ class PosedScene:
 def assemble(scene: PosedScene, options: ReadOptions) -> Sequence:
     """The scene as a Sequence, whose pictures are read when they are asked for. Raises InputError naming the file and
     the fault, see the tests of what is refused."""
-    seq = arrange(scene, options)
-    place(seq, scene.points, options, scene.path)
+    return placed(arrange(scene, options), scene, options)
+
+
+def placed(seq: Sequence, scene: PosedScene, options: ReadOptions, masks: np.ndarray | None = None) -> Sequence:
+    """The same of a scene that is arranged. masks: `placing.small_masks`, where they are known. Raises InputError."""
+    place(seq, scene.points, options, scene.path, masks)
     if any(p.mask for p in scene.pictures) and not all(p.mask for p in scene.pictures):
         assert isinstance(seq.picture, Pictures)
         seq.hull = MaskHulls(seq, seq.picture)

@@ -15,6 +15,7 @@ FPS = 24.0  # where nothing tells the rate
 SNAP = 1e-3  # frames: as much rounding of a printed time is taken back
 STILL = "none"  # as a pattern: the pictures show one moment
 _FRAME_FOLDER = re.compile(r"(?:frame|time|step)s?[_-]?(\d+(?:\.\d+)?)", re.IGNORECASE)
+_FRAME_FILE = re.compile(r"(?:frame|time|step)[_-]?(\d+(?:\.\d+)?)[_-](.+)", re.IGNORECASE)
 _LAST_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 
@@ -66,8 +67,9 @@ def clip_of(names: list[str], times: list[float | None], frames: list[float | No
 def of_names(names: list[str], pattern: str | None) -> tuple[list[float | None], list[str | None]]:
     """Frame numbers and cameras that the pictures' paths tell, None where they tell none. pattern: a regular expression
     with a group around the frame's number, and perhaps one named `camera`; or `none`. Without one, names tell the time
-    where folders do as in `frame_0012/cam3.png`, or where several folders, one a camera, hold the same numbers. Raises
-    InputError for a pattern that is no expression, has no group, or does not fit a name."""
+    where all do as in `frame_0012_cam3.png`, where folders do as in `frame_0012/cam3.png`, or where several folders,
+    one a camera, hold the same numbers. Raises InputError for a pattern that is no expression, has no group, or does
+    not fit a name."""
     nothing: tuple[list[float | None], list[str | None]] = [None] * len(names), [None] * len(names)
     if pattern == STILL:
         return nothing
@@ -80,6 +82,9 @@ def of_names(names: list[str], pattern: str | None) -> tuple[list[float | None],
             raise InputError(f"--times {pattern}: put round brackets around what is the frame's number.")
         return _by_pattern(names, compiled, pattern)
     paths = [PurePosixPath(n) for n in names]
+    flat = [_FRAME_FILE.fullmatch(p.stem) for p in paths]
+    if all(flat) and len({m[1] for m in flat if m}) > 1:
+        return [float(m[1]) for m in flat if m], [m[2] for m in flat if m]
     above = [_FRAME_FOLDER.fullmatch(p.parent.name) for p in paths]
     if all(above) and len({p.parent for p in paths}) > 1:
         return [float(m[1]) for m in above if m], [p.stem for p in paths]

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ...datagen.sequence import WINDOWS, InputError, move
+from ...datagen.sequence import InputError
+from ...datagen.whole_folders import WINDOWS, move
 
 
 @contextmanager

@@ -9,6 +9,9 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from ...datagen.readers import DEFAULTS, ReadOptions
+from ...datagen.readers.options import add_arguments as add_reading
+from ...datagen.readers.options import from_arguments
 from ...datagen.sequence import InputError
 from .clip_groups import parse_mix
 
@@ -57,12 +60,13 @@ class TrainConfig:
     device: str = "cpu"
     cache: Path = Path("data/cache")
     seed: int = 0
+    reading: ReadOptions = DEFAULTS  # what is said of others' folders
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> TrainConfig:
         """Of what a parser with `add_arguments` has parsed. Raises InputError."""
-        values = {f.name: getattr(args, f.name) for f in fields(cls)}
-        return cls(**values | {"data": tuple(args.data)})
+        values = {f.name: getattr(args, f.name) for f in fields(cls) if f.name != "reading"}
+        return cls(**values | {"data": tuple(args.data), "reading": from_arguments(args)})
 
     def __post_init__(self) -> None:
         if not 0 < self.rate < math.inf:
@@ -130,3 +134,4 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--cache", type=Path, help="where packed clips are kept (default: %(default)s)")
     p.add_argument("--seed", type=int, help="of weights and samples (default: %(default)s)")
     p.set_defaults(**{f.name: f.default for f in fields(TrainConfig) if f.default is not MISSING})
+    add_reading(p)

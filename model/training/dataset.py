@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from ...datagen.curation.decisions import CURATION, OUT, decided
 from ...datagen.curation.measures import motion_of
-from ...datagen.readers import described_by, open_sequence, sequences_in
+from ...datagen.readers import DEFAULTS, ReadOptions, described_by, open_sequence, sequences_in
 from ...datagen.rigs import CANONICAL
 from ...datagen.sequence import InputError, Sequence
 from ..views import Views, shrink
@@ -49,12 +49,13 @@ class ClipDataset:
         sampling: str = "setups",
         mix: str = "uniform",
         has_depth: bool = True,
+        reading: ReadOptions = DEFAULTS,
     ):
         """folders: Sequence folders, or folders that hold them at any depth. Samples are `shrink` times smaller
         than what was rendered. sampling: see view_sampling.py; mix: see clip_groups.py; has_depth: whether inputs come
-        with depth and flow. Where `timesplat curate` was called, its sets are the groups, and what it threw out is left
-        out. Raises InputError where there is no Sequence, none that the mix would draw, or one without the passes that
-        are needed."""
+        with depth and flow; reading: what is said of others' folders. Where `timesplat curate` was called, its sets are
+        the groups, and what it threw out is left out. Raises InputError where there is no Sequence, none that the mix
+        would draw, or one without the passes that are needed."""
         self.shrink, self.sampling, self.has_depth = shrink, sampling, has_depth
         folders = list(folders)
         found = [p for f in folders for p in sequences_in(f)]
@@ -67,7 +68,7 @@ class ClipDataset:
                 f"{folders[0]}: {CURATION} throws out all of its Sequences; put some back by its column override."
             )
         bar = tqdm(found, desc="packing", unit="clip", leave=False, disable=None)
-        self.paths = [pack(f, cache, has_depth) for f in bar]
+        self.paths = [pack(f, cache, has_depth, reading) for f in bar]
         self.groups: dict[str, list[Path]] = {g: [] for g in GROUPS}
         for folder, path in zip(found, self.paths, strict=True):
             with safe_open(path, "pt") as f:
@@ -97,18 +98,19 @@ class ClipDataset:
         return Sample(seen, wanted, meta["asset"])
 
 
-def pack(folder: Path, cache: Path, has_depth: bool = True) -> Path:
+def pack(folder: Path, cache: Path, has_depth: bool = True, reading: ReadOptions = DEFAULTS) -> Path:
     """Sequence folder -> one .safetensors below `cache`, made anew when the Sequence changed. has_depth: whether depth
     and flow are needed; where they are not, a Sequence that lacks them for a view is packed without any, by another
     name. Raises InputError for a Sequence that cannot be read, or lacks what is needed."""
     folder = Path(folder)
     stamp = " ".join(str(path.stat().st_mtime_ns) for path in described_by(folder)) or 0
-    key = hashlib.sha256(f"{PACKED_VERSION} {folder.resolve()} {stamp}".encode()).hexdigest()[:16]
+    told = "" if reading == DEFAULTS else f" {reading}"
+    key = hashlib.sha256(f"{PACKED_VERSION} {folder.resolve()} {stamp}{told}".encode()).hexdigest()[:16]
     path, pictures = (Path(cache) / f"{key}{end}.safetensors" for end in ("", "-pictures"))
     for made in (path,) if has_depth else (path, pictures):
         if made.exists():
             return made
-    seq = open_sequence(folder)
+    seq = open_sequence(folder, reading)
     whole = all(v.passes for v in seq.views)
     if has_depth and not whole:
         raise InputError(

@@ -69,7 +69,8 @@ def load_clips(config: TrainConfig) -> ClipDataset:
     if distributed.rank():
         distributed.barrier()
     has_depth = network_config(config).source == "given" or config.geometric > 0
-    clips = ClipDataset(config.data, config.cache, config.shrink, config.sampling, config.mix, has_depth)
+    how = (config.shrink, config.sampling, config.mix, has_depth, config.reading)
+    clips = ClipDataset(config.data, config.cache, *how)
     if not distributed.rank():
         distributed.barrier()
     return clips

@@ -10,6 +10,7 @@ from PIL import Image
 
 from timesplat.cli import main
 from timesplat.datagen.inspection import counts, coverage, inspect, light, lying, repeated
+from timesplat.datagen.readers import placing
 from timesplat.datagen.readers.options import ReadOptions
 from timesplat.datagen.sequence import InputError, Sequence, View, opengl_to_opencv
 
@@ -46,6 +47,9 @@ def test_the_axes_that_fit_are_told(tmp_path, taken, axes):
     write_transforms(tmp_path, taken, frame=lambda k, s: how | {"transform_matrix": WRITTEN[axes](s.c2w).tolist()})
     found = inspect(tmp_path, ReadOptions())
     assert found.advice and f"pass --axes {axes}" in found.advice and not found.placed
+    assert not any("for its cameras" in x for x in found.lines), (
+        "how cameras lie that are read wrongly is nothing to say"
+    )
     again = inspect(tmp_path, ReadOptions(axes=axes))
     assert again.advice is None and again.placed and "agree" in again.agreement
 
@@ -62,6 +66,18 @@ def test_of_d_nerf_too(tmp_path, taken):
     (tmp_path / "transforms_train.json").write_text(json.dumps(d))
     assert "pass --axes w2c-opengl" in inspect(tmp_path, ReadOptions()).advice
     assert inspect(tmp_path, ReadOptions(axes="w2c-opengl")).placed
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_silhouettes_are_cut_out_once(tmp_path, taken, monkeypatch, wrong):
+    """They are most of the time that it takes."""
+    write_pictures(tmp_path, taken)
+    how = lambda k, s: {"time": None, "transform_matrix": (opengl_to_opencv(s.c2w) if wrong else s.c2w).tolist()}  # noqa: E731
+    write_transforms(tmp_path, taken, frame=how)
+    read, cut = [], placing._alpha
+    monkeypatch.setattr(placing, "_alpha", lambda seq, i: read.append(i) or cut(seq, i))
+    found = inspect(tmp_path, ReadOptions())
+    assert sorted(read) == list(range(16)) and found.placed != wrong and (found.advice is not None) == wrong
 
 
 def test_what_nothing_fits_is_refused(tmp_path, taken):

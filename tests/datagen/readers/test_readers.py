@@ -190,3 +190,25 @@ def test_a_folder_of_others_is_reconstructed_and_evaluated(tmp_path, capsys):
     rows = [json.loads(x) for x in (tmp_path / "out" / "rows.jsonl").read_text().splitlines()]
     assert [(r["object"], len(r["frames"]["psnr"])) for r in rows] == [("scene", 3)] * 2
     assert main(["reconstruct", str(tmp_path / "scene"), "--axes", "unity", "--out", str(ply)]) == 2
+
+
+def test_what_is_said_of_a_folder_counts_in_every_command(tmp_path, capsys):
+    """Cameras with other axes: evaluate and train read them as --axes says, and refuse them without."""
+    pytest.importorskip("torch")
+    from timesplat.cli import main
+    from timesplat.datagen.sequence import opengl_to_opencv
+    from timesplat.model.training.dataset import ClipDataset
+
+    taken = shots(12, lens=PLAIN.resized(32, 32))
+    write_pictures(tmp_path / "scene", taken)
+    turned = lambda k, s: {"transform_matrix": opengl_to_opencv(s.c2w).tolist()}  # noqa: E731
+    write_transforms(tmp_path / "scene", taken, frame=turned, test_filenames=["images/0009.png"])
+    words = ["evaluate", str(tmp_path / "scene"), "--setup", "split", "--size", "16", "--methods", "white,hull"]
+    assert main([*words, "--out", str(tmp_path / "no")]) == 2 and "do not look at one object" in capsys.readouterr().err
+    assert main([*words, "--axes", "opencv", "--out", str(tmp_path / "yes")]) == 0
+    rows = [json.loads(x) for x in (tmp_path / "yes/rows.jsonl").read_text().splitlines()]
+    assert rows[1]["psnr"] > rows[0]["psnr"]
+    with pytest.raises(InputError, match="do not look at one object"):
+        ClipDataset([tmp_path / "scene"], tmp_path / "packed", has_depth=False)
+    told = ClipDataset([tmp_path / "scene"], tmp_path / "packed", has_depth=False, reading=ReadOptions(axes="opencv"))
+    assert len(told.paths) == 1

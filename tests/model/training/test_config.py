@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from timesplat.datagen.readers.options import ReadOptions
 from timesplat.datagen.sequence import InputError
 from timesplat.model.training.config import TrainConfig, add_arguments, choices
 
@@ -20,7 +21,10 @@ def test_the_command_line_has_an_option_for_every_field_and_its_default():
     assert parse() == TrainConfig((Path("a"), Path("b")), Path("run"))
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    assert {a.dest for a in parser._actions} - {"help"} == {f.name for f in fields(TrainConfig)}
+    of_reading = {f.name for f in fields(ReadOptions)}
+    named = {f.name for f in fields(TrainConfig)} - {"reading"}
+    assert {a.dest for a in parser._actions} - {"help"} - of_reading == named
+    assert parse("--axes opencv --fps 5").reading == ReadOptions(axes="opencv", fps=5)
     for field in fields(TrainConfig):
         if field.default is not MISSING:
             assert parser.get_default(field.name) == field.default
