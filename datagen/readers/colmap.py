@@ -62,11 +62,18 @@ def read_colmap(folder: Path) -> PosedScene:
         masks = (f"masks/{name}.png", f"masks/{Path(name).with_suffix('.png').as_posix()}")
         mask = next((m for m in masks if (folder / m).is_file()), None)
         scene.pictures.append(Posed(f"{home}{name}", w2c, lenses[camera], mask=mask))
-    points = model / f"points3D{suffix}"
-    if points.is_file():
-        with _read(points):
-            scene.points = _points_bin(points) if binary else _points_txt(points)
+    scene.points = read_points(model)
     return scene
+
+
+def read_points(model: Path) -> np.ndarray | None:
+    """(P,3) of points3D, where there is such a table. Raises InputError."""
+    for suffix, read in ((".bin", _points_bin), (".txt", _points_txt)):
+        path = model / f"points3D{suffix}"
+        if path.is_file():
+            with _read(path):
+                return read(path)
+    return None
 
 
 def _read(path: Path):

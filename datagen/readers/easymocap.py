@@ -79,7 +79,7 @@ def read_easymocap(folder: Path) -> PosedScene:
                 cameras = {str(name): dict(c) for name, c in d.items() if isinstance(c, dict)}
         if not cameras:
             raise ValueError("it has no cameras")
-        scene = PosedScene(folder, path, "EasyMocap", [], axes="w2c-opencv", upright=False)
+        scene = PosedScene(folder, path, "EasyMocap", [], axes="w2c-opencv", counted=True, upright=False)
         fill = _of_names(folder, cameras) if listed is None else listed
         for name, camera in cameras.items():
             matrix, lens = _pose(name, camera), None

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..sequence import InputError, read_from
+from .colmap import model_folder, read_points
 from .lenses import Lens
 from .posed import REMEDY, Posed, PosedScene
 from .videos import SUFFIXES, video_of
@@ -38,7 +39,7 @@ def read_llff(folder: Path) -> PosedScene:
     videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
     folders = [] if videos else _camera_folders(folder)
     if videos:
-        scene.layout = "Neu3D"
+        scene.layout, scene.counted = "Neu3D", True
         _same_number(path, len(table), len(videos), "videos")
         films = [video_of(p) for p in videos]
         scene.fps, shortest = films[0].rate, min(len(f.stamps) for f in films)
@@ -52,7 +53,7 @@ def read_llff(folder: Path) -> PosedScene:
                 for n in range(shortest)
             ]
     elif folders:
-        scene.layout = "Neu3D"
+        scene.layout, scene.counted = "Neu3D", True
         _same_number(path, len(table), len(folders), "cameras' folders")
         for k, (files, row) in enumerate(zip(folders, table, strict=True)):
             c2w, lens = _camera(row)
@@ -69,6 +70,8 @@ def read_llff(folder: Path) -> PosedScene:
         for k, (p, row) in enumerate(zip(files, table, strict=True)):
             c2w, lens = _camera(row)
             scene.pictures.append(Posed(f"images/{p.name}", c2w, lens, rig="train" if k % HELD else "target"))
+    if (model := model_folder(folder)) is not None:  # of COLMAP, in whose world LLFF's cameras are
+        scene.points = read_points(model)
     return scene
 
 

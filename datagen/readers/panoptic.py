@@ -20,7 +20,7 @@ FPS = 30.0  # of the benchmark's videos
 
 def read_panoptic(folder: Path) -> PosedScene:
     """What the two files in a folder say. Raises InputError naming the file and the fault."""
-    scene = PosedScene(folder, folder / "train_meta.json", "Panoptic", [], axes="w2c-opencv", fps=FPS)
+    scene = PosedScene(folder, folder / "train_meta.json", "Panoptic", [], axes="w2c-opencv", fps=FPS, counted=True)
     for name, rig in SPLITS.items():
         path = folder / name
         if not path.is_file():

@@ -57,6 +57,7 @@ class PosedScene:
     fps: float | None = None
     frame_range: tuple[int | None, int | None] = (None, None)
     points: np.ndarray | None = None  # (P,3) that are known of the scene, in the cameras' world
+    counted: bool = False  # whether frames are numbers that the reader gave; if all are the same, it is one moment
     upright: bool | None = None  # whether EXIF's rotation is carried out; None: as the stated sizes say
     notes: list[str] = field(default_factory=list)
     provenance: dict = field(default_factory=dict)
@@ -105,7 +106,9 @@ def arrange(scene: PosedScene, options: ReadOptions) -> Sequence:
 
     names, cameras = [p.image for p in scene.pictures], [p.camera for p in scene.pictures]
     times, frames = [p.time for p in scene.pictures], [p.frame for p in scene.pictures]
-    by_name = options.times is not None or all(x is None for x in (*times, *frames))
+    if scene.counted and len(set(frames)) == 1:
+        frames = [None] * len(frames)
+    by_name = options.times is not None or (not scene.counted and all(x is None for x in (*times, *frames)))
     if by_name:
         times = [None] * len(names)
         frames, named = of_names(names, options.times)

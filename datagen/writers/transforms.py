@@ -71,8 +71,8 @@ def _frame(seq: Sequence, v: View, name: str) -> dict:
         "cx": v.cx,
         "cy": v.cy,
         "transform_matrix": v.c2w.tolist(),
-        "time": seq.unit_time(v.frame),
-        "frame": v.frame,
         "camera": v.camera,
         "rig": v.rig,
+        # All times the same would be taken for a mistake.
+        **({"time": seq.unit_time(v.frame), "frame": v.frame} if seq.frame_end > seq.frame_start else {}),
     }

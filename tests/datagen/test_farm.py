@@ -18,10 +18,13 @@ import pytest
 from timesplat.datagen import farm
 from timesplat.datagen.farm import render_assets, render_shots
 from timesplat.datagen.licences import Licences
+from timesplat.datagen.readers import sequences_in
 from timesplat.datagen.render_index import Row, read_index
 from timesplat.datagen.render_job import RenderSettings
 from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, read_sequence
+
+from .writers.conftest import make as make_sequence
 
 SMALL = RenderSettings(rig="alternating", frames=4, size=24, samples=1)
 
@@ -343,3 +346,24 @@ def test_no_graphics_card_is_said(assets, tmp_path):
 
 def test_seeds():
     assert farm.parse_seeds("0-3, 7,9-9") == [0, 1, 2, 3, 7, 9] and farm.parse_seeds(None) == []
+
+
+def test_in_another_programs_layout(tmp_path, monkeypatch, capsys):
+    """The Sequences, from which a run goes on, are kept in a hidden folder; what is done is not done again."""
+    made = []
+
+    def render(assets, out, *_, **__):
+        folder = out / "box/run"
+        if not folder.exists():
+            make_sequence(folder, moments=2)
+            made.append(folder)
+        return [folder], []
+
+    monkeypatch.setattr(farm, "render_assets", render)
+    command = arguments("box.glb", "--out", str(tmp_path / "out"), "--layout", "nerfstudio")
+    assert farm.run(command) == 0 and "1 sequences in" in capsys.readouterr().out
+    written = tmp_path / "out/box/run/transforms.json"
+    first = written.stat()
+    assert "format" not in json.loads(written.read_text()) and made == [tmp_path / "out/.sequences/box/run"]
+    assert sequences_in(tmp_path / "out") == [tmp_path / "out/box/run"]
+    assert farm.run(command) == 0 and written.stat().st_mtime_ns == first.st_mtime_ns and len(made) == 1
