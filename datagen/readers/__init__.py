@@ -20,6 +20,8 @@ from .easymocap import PAIR, TABLES, camera_files, read_easymocap
 from .llff import FILE as LLFF
 from .llff import read_llff
 from .options import ReadOptions
+from .options import add_arguments as add_arguments  # for commands, with the next
+from .options import from_arguments as from_arguments
 from .panoptic import SPLITS as META_SPLITS
 from .panoptic import read_panoptic
 from .posed import PosedScene, arrange, assemble, at_rate, placed

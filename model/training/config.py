@@ -9,9 +9,8 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from ...datagen.readers import DEFAULTS, ReadOptions
-from ...datagen.readers.options import add_arguments as add_reading
-from ...datagen.readers.options import from_arguments
+from ...datagen.readers import DEFAULTS, ReadOptions, from_arguments
+from ...datagen.readers import add_arguments as add_reading
 from ...datagen.sequence import InputError
 from .clip_groups import parse_mix
 
