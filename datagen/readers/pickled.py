@@ -24,7 +24,7 @@ class _Kind:
         kind = np.dtype(self.code)
         if kind.hasobject:
             raise ValueError(f"an array of {self.code}")
-        return kind.newbyteorder(self.order if self.order in "<>" else "=")
+        return kind.newbyteorder(">") if self.order == ">" else kind
 
 
 class _Array:
@@ -37,8 +37,7 @@ class _Array:
         if isinstance(data, list):  # of objects
             self.value = data
         else:
-            order = "F" if by_columns else "C"
-            self.value = np.frombuffer(data, kind.dtype()).reshape(shape, order=order)
+            self.value = _shaped(np.frombuffer(data, kind.dtype()), shape, by_columns)
 
 
 def _scalar(kind: _Kind, data: bytes) -> Any:
@@ -46,7 +45,11 @@ def _scalar(kind: _Kind, data: bytes) -> Any:
 
 
 def _whole(data: bytes, kind: _Kind, shape: tuple, order: Any) -> np.ndarray:
-    return np.frombuffer(data, kind.dtype()).reshape(shape, order="F" if order == "F" else "C")
+    return _shaped(np.frombuffer(data, kind.dtype()), shape, order == "F")
+
+
+def _shaped(flat: np.ndarray, shape: tuple, by_columns: bool) -> np.ndarray:
+    return flat.reshape(shape[::-1]).T if by_columns else flat.reshape(shape)
 
 
 def _encode(text: str, _coding: str = "latin1") -> bytes:

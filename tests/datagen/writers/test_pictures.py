@@ -10,7 +10,7 @@ from timesplat.datagen.readers.lenses import Lens
 from timesplat.datagen.sequence import Sequence, View
 from timesplat.datagen.writers.pictures import Square, camera_names, frame_names, put, splits_of
 
-from ..readers.worlds import photograph, shots
+from ..readers.worlds import photograph, shots, still
 from .conftest import SQUARE, make
 
 
@@ -54,7 +54,7 @@ def test_others_are_as_a_square_camera_takes_them(tmp_path):
     lens = Lens(square.side, square.side, 51.0, 51.0, square.side / 2, square.side / 2)
     for k, s in enumerate(shots(7, lens=lens)):
         square.put(seq, k, tmp_path / "x.png")
-        got, truth = np.asarray(Image.open(tmp_path / "x.png")), photograph(s)
+        got, truth = np.asarray(Image.open(tmp_path / "x.png")), photograph(still(s))
         inner = slice(square.side // 2 - 17, square.side // 2 + 17)  # which the view shows in full
         assert np.abs(got[inner, inner, 3].astype(int) - truth[inner, inner, 3]).mean() < 6
         assert (got[0, :, 3] == 0).all()  # above the view nothing is
