@@ -238,6 +238,7 @@ def test_what_the_worker_starts_does_not_wait_for_its_input():
     """On Windows a program hangs at its start while the pipe that it inherits is read; so it inherits nothing."""
     code = """
 import subprocess, sys
+from timesplat.model import worker
 def task(request, progress):
     said = subprocess.run([sys.executable, "-c", "print(len(input() or 'x'))"], capture_output=True, text=True).stderr
     return {"report": [said.strip().splitlines()[-1]]}

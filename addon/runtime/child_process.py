@@ -24,7 +24,8 @@ import threading
 import time
 from pathlib import Path
 
-from ...datagen.sequence import WINDOWS, InputError
+from ...datagen.errors import InputError
+from ...datagen.whole_folders import WINDOWS
 
 PACKAGE = Path(__file__).resolve().parents[2]
 # Imports this folder as the package `timesplat`, whatever the folder is called, and runs one module of it. (Its

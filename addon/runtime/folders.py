@@ -9,7 +9,7 @@ from pathlib import Path
 
 import bpy
 
-from ...datagen.sequence import WINDOWS
+from ...datagen.whole_folders import WINDOWS
 
 ADDON = __package__.rsplit(".", 2)[0]  # what Blender knows the add-on by
 

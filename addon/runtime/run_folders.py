@@ -10,7 +10,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ...datagen.sequence import WINDOWS
+from ...datagen.whole_folders import WINDOWS
 from .folders import user_folder
 
 

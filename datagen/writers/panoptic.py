@@ -28,7 +28,7 @@ def write_panoptic(seq: Sequence, folder: Path, progress: Progress) -> None:
     cameras = {w: n for n, w in enumerate(dict.fromkeys(who))}
     files: dict[str, dict] = {}
     for name in ("train_meta.json", "test_meta.json"):
-        empty = {key: [[] for _ in moments] for key in ("k", "w2c", "fn", "cam_id")}
+        empty: dict[str, list] = {key: [[] for _ in moments] for key in ("k", "w2c", "fn", "cam_id")}
         files[name] = {"w": seq.width, "h": seq.height, **empty}
     for i, v in enumerate(seq.views):
         progress(i / len(seq.views), "writing pictures")

@@ -62,7 +62,8 @@ def to_sequence(views: Views, folder: Path, condition: Condition) -> Sequence:
     seq = Sequence(width, height, FPS, 0, MOMENTS - 1, provenance={"condition": vars(condition), "asset": "stress"})
     for i, at in enumerate(moment.tolist()):
         frame = round(at) if abs(at - round(at)) < 1e-4 else at
-        seq.views.append(View(frame, f"c{i:03d}", "input", c2w[i], *map(float, views.intrinsics[i])))
+        fx, fy, cx, cy = views.intrinsics[i].tolist()
+        seq.views.append(View(frame, f"c{i:03d}", "input", c2w[i], fx, fy, cx, cy))
 
     def fill(root: Path) -> None:
         (root / "images").mkdir()
