@@ -187,6 +187,6 @@ def background_of(
     if measured := common_colour(s.read(remedy)[..., :3] for s in chosen):
         return measured, f"what is {measured} and reaches the border is background, as measured there"
     return None, (
-        "no alpha, no masks, no constant colour behind the object: all that is seen counts as the object, and what "
-        "lies outside of the volume, which is not supported yet, comes out blurred; give masks"
+        "no alpha, no masks, no constant colour behind the object: the whole scene is reconstructed, what lies far "
+        "outside of the volume too; for the object alone give masks"
     )

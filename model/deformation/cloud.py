@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..gaussians import Gaussians4D
 from ..geometry.shared_paths import ride
+from ..geometry.surroundings import expanded
 from ..io.asset import STATIC_SIGMA_T
 from ..rotations import quaternion_multiply
 from ..tracks import Tracks4D
@@ -67,6 +68,7 @@ class DeformingCloud:
     control: ControlPoints
     near: Tensor  # (N,K) int32
     weight: Tensor  # (N,K)
+    whole: bool = False  # all of a scene: it lies and moves in contracted space (`geometry/surroundings.py`)
     poses: dict[float, tuple[Tensor, Tensor]] = field(default_factory=dict)  # of the control points, at times asked for
 
     def __post_init__(self):
@@ -88,8 +90,16 @@ class DeformingCloud:
         v, held = self.values, (self.near, self.weight, self.control.rest)
         xyz, rotation = Skin.apply(*held, *self.pose(t), v["xyz"], self.rotation)
         still, always = torch.zeros_like(self.opacity), torch.full_like(self.opacity, STATIC_SIGMA_T)
+        xyz, scale = self._expanded(xyz)
         velocity = torch.zeros_like(xyz)
-        return Gaussians4D(xyz, still, velocity, always, self.scale, rotation, v["rgb"], self.opacity)
+        return Gaussians4D(xyz, still, velocity, always, scale, rotation, v["rgb"], self.opacity)
+
+    def _expanded(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (N,3) as they are moved -> places and scales (N,3) of the scene."""
+        if not self.whole:
+            return xyz, self.scale
+        places, larger = expanded(xyz)
+        return places, self.scale * larger
 
     @torch.no_grad()
     def to_tracks(self, frames: int, tolerance: float) -> Tracks4D:
@@ -100,12 +110,14 @@ class DeformingCloud:
             Skin.apply(self.near, self.weight, control.rest, *self.pose(t), v["xyz"], one)
             for t in torch.linspace(-1, 1, frames).tolist()
         ]
-        place, turn = (torch.stack([m[i] for m in moved], 1) for i in range(2))
+        scales = [self._expanded(m[0])[1] for m in moved]
+        place = torch.stack([self._expanded(m[0])[0] for m in moved], 1)
+        turn = torch.stack([m[1] for m in moved], 1)
         window = torch.tensor([0, frames - 1]).expand(len(self), 2)
         path, offset, rotation, paths = ride(place, turn, window, tolerance)
         return Tracks4D(
             offset=offset,
-            scale=self.scale.clone(),
+            scale=scales[len(scales) // 2].clone(),
             rotation=F.normalize(quaternion_multiply(rotation, self.rotation), dim=-1),
             rgb=v["rgb"].clone(),
             opacity=self.opacity.clone(),

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..fitting.budget import parse_budget
-from ..fitting.densify import Densifier, Pace
+from ..fitting.densify import OUTSIDE, Densifier, Pace
 from ..fitting.fit_views import detached, reduction
 from ..fitting.loop import Pyramid, Schedule, Step, gradients, optimise, photometric_loss, warm_up
 from ..fitting.parameters import Parameters
@@ -25,6 +25,7 @@ from ..fitting.quality import Quality
 from ..fitting.refine import part
 from ..geometry.silhouettes import points_inside
 from ..geometry.surface_tracks import pixel_size
+from ..geometry.surroundings import is_whole, points_around
 from ..tracks import Tracks4D
 from ..views import Views
 from .cloud import SEEN, ControlPoints, DeformingCloud
@@ -35,6 +36,8 @@ LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
 PER_PIXEL = 4  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view
 MAX_GAUSSIANS = 100_000
+FARTHEST = 2.0  # where contracted space ends
+SCENE_START = 10_000  # Gaussians at the start of a whole scene
 
 
 @dataclass(frozen=True)
@@ -103,12 +106,18 @@ class _Fit:
         self.generator = torch.Generator().manual_seed(seed)
         self.sharp = SHARP[len(views) >= SEVERAL * len(views.time.unique())]
         middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
-        xyz, rgb = points_inside(middle, min(fit.start, self.stage.gaussians), self.generator)
+        self.whole = is_whole(views)
+        if self.whole:
+            near = views.time.abs() <= middle.time.abs().max() + 1e-6
+            xyz, rgb = points_around(views[near], min(SCENE_START, self.stage.gaussians), self.generator)
+        else:
+            xyz, rgb = points_inside(middle, min(fit.start, self.stage.gaussians), self.generator)
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
         first, last = fit.xyz
         rates["xyz"] = first * self.pixel * smaller, last * self.pixel
-        rates["motion"] = tuple(views.frame_step * r for r in fit.motion)
+        moves = float(views.time.max() - views.time.min()) > 0
+        rates["motion"] = tuple(moves * views.frame_step * r for r in fit.motion)
         values = self._start(xyz, rgb) | {"motion": self.table.zeros()}
         self.parameters = Parameters(values, rates, common=["motion"])
         self.densifier = self._densifier()
@@ -142,10 +151,12 @@ class _Fit:
         return next((stage for stage in self.stages if fraction < stage.until), self.stages[-1])
 
     def _densifier(self) -> Densifier:
-        return Densifier(self.parameters, self.generator, self.stage.gaussians, self.stage.pace)
+        return Densifier(
+            self.parameters, self.generator, self.stage.gaussians, self.stage.pace, FARTHEST if self.whole else OUTSIDE
+        )
 
     def cloud(self) -> DeformingCloud:
-        return DeformingCloud(self.parameters.values, self.table, self.control, self.near, self.weight)
+        return DeformingCloud(self.parameters.values, self.table, self.control, self.near, self.weight, self.whole)
 
     def grown(self, fraction: float) -> DeformingCloud:
         """A cloud of as many Gaussians as there will be at about this share of the schedule, by which it is planned."""
@@ -153,7 +164,7 @@ class _Fit:
         rows = torch.arange(max(count, n)) % n
         values = {k: v if k == "motion" else v[rows] for k, v in self.parameters.values.items()}
         values["scale"] = values["scale"] - 0.5 * math.log(len(rows) / n)
-        return DeformingCloud(values, self.table, self.control, self.near[rows], self.weight[rows])
+        return DeformingCloud(values, self.table, self.control, self.near[rows], self.weight[rows], self.whole)
 
     def choose(self, fraction: float, count: int) -> list[int] | None:
         """Views of the moments that the fit has come to, half of them of those that came last; later all in turn."""

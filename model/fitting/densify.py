@@ -44,8 +44,17 @@ PACE = Pace()
 class Densifier:
     """Accumulates the positional gradients of a fit's steps, and densifies by them."""
 
-    def __init__(self, parameters: Parameters, generator: torch.Generator, max_gaussians: int, pace: Pace = PACE):
+    def __init__(
+        self,
+        parameters: Parameters,
+        generator: torch.Generator,
+        max_gaussians: int,
+        pace: Pace = PACE,
+        outside: float = OUTSIDE,
+    ):
+        """outside: half the side of the box beyond which Gaussians are lost."""
         self.parameters, self.generator, self.max_gaussians, self.pace = parameters, generator, max_gaussians, pace
+        self.outside = outside
         self._restart()
 
     def _restart(self) -> None:
@@ -59,19 +68,24 @@ class Densifier:
         if step % pace.every or not pace.since <= fraction < pace.until:
             return False
         share = pace.share_now(step, fraction, len(self.grad_accum), self.max_gaussians)
-        densify(p, self.grad_accum, self.generator, self.max_gaussians, share)
+        densify(p, self.grad_accum, self.generator, self.max_gaussians, share, self.outside)
         self._restart()
         return True
 
 
 @torch.no_grad()
 def densify(
-    p: Parameters, grad_accum: Tensor, generator: torch.Generator, max_gaussians: int, share: float = SHARE
+    p: Parameters,
+    grad_accum: Tensor,
+    generator: torch.Generator,
+    max_gaussians: int,
+    share: float = SHARE,
+    outside: float = OUTSIDE,
 ) -> None:
     """Removes the faint and the lost, and splits the share of the rest with the largest accumulated gradients
     (grad_accum (N,)) in two: smaller, and apart by a random step within the Gaussian, so that both together look
     about as it did; never more than `max_gaussians` in all."""
-    keep = (torch.sigmoid(p["opacity"]) > FAINT) & (p["xyz"].abs().amax(-1) < OUTSIDE)
+    keep = (torch.sigmoid(p["opacity"]) > FAINT) & (p["xyz"].abs().amax(-1) < outside)
     kept = keep.nonzero()[:, 0]
     n = len(kept)
     count = max(min(int(share * n), max_gaussians - n), 0)

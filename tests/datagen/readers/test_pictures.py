@@ -136,7 +136,7 @@ def test_what_is_said_of_backgrounds(tmp_path):
     found, told = background_of([white], False, False, "auto", REMEDY)
     assert found and found.colour == (255, 255, 255) and "#ffffff" in told and "as measured" in told
     found, told = background_of([none], False, False, "auto", REMEDY)
-    assert found is None and "not supported yet" in told
+    assert found is None and "the whole scene" in told
     assert background_of([none], False, False, "black", REMEDY)[0].colour == (0, 0, 0)
     assert background_of([white], False, True, "auto", REMEDY) == (None, "alpha says what is the object")
     assert "1 pictures have none" in background_of([masked, none], True, False, "auto", REMEDY)[1]

@@ -252,7 +252,7 @@ def test_without_anything_that_tells_the_object(tmp_path, taken):
     for k in range(12):
         save(tmp_path / f"images/{k:04d}.png", rng.integers(0, 256, (20, 24, 3), np.uint8))
     seq = open_sequence(write_transforms(tmp_path, taken))
-    assert any("not supported yet" in x for x in seq.provenance["read"]) and seq.load_image(3)[..., 3].min() == 255
+    assert any("the whole scene" in x for x in seq.provenance["read"]) and seq.load_image(3)[..., 3].min() == 255
     assert seq.normalisation.translation == pytest.approx((0, 0, 0), abs=1e-6)
     rows = [[0.1 * a, 0.1 * b, 0.1 * c] for a in range(5) for b in range(5) for c in range(5)]
     (tmp_path / "transforms.json").unlink()

@@ -13,6 +13,8 @@ from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.rasterize import render
 from timesplat.model.views import Views
 
+from ..geometry.test_surroundings import room
+
 FRAMES, SIZE = 8, 32
 
 
@@ -79,6 +81,16 @@ def test_pictures_double_from_about_128_pixels_to_their_own_size():
         [128, 256],
     ]
     assert [size for _, size in pyramid_of(1024)] == [128, 256, 512] == [size for _, size in pyramid_of(1023)]
+
+
+def test_all_of_a_room_is_reconstructed_far_walls_too():
+    """The walls are six times as far as the volume reaches, and nothing moves."""
+    views = room(SIZE)
+    own, other = views[[i for i in range(24) if i % 7]], views[[7, 14]]
+    tracks = reconstruct_deform(own, steps=500, budget="1000")
+    g = tracks.at(0.0)
+    assert (g.xyz.abs().amax(-1) > 3).float().mean() > 0.5 and torch.equal(g.xyz, tracks.at(0.7).xyz)
+    assert psnr(tracks, own) > 20 and psnr(tracks, other) > 16
 
 
 def test_a_budget_of_one():
