@@ -182,7 +182,7 @@ def _render_frames(
         shots = displace.counter_moved(shots, subject.shift)
     step = _scene_frames_per_frame(subject.frames) if settings.passes else 1
     if step != 1:
-        lengthen_frames(cameras.stage, step)
+        step = lengthen_frames(cameras.stage, step)
     for frame, group in groupby(shots, key=lambda shot: shot.frame):
         go_to(cameras.stage, subject.frames[frame], step)
         if settings.engine == "CYCLES":

@@ -14,26 +14,29 @@ from fractions import Fraction
 from ..errors import InputError
 
 _LARGEST = 900  # of the two numbers whose ratio Blender takes for the length of a frame
-_OFF = 1e-4  # frames that the last of a hundred steps may be off
 
 
-def lengthen_frames(stage, step: float) -> None:
-    """One frame of the scene `stage` is `step` of what it was. InputError where no two of Blender's numbers say so."""
+def lengthen_frames(stage, step: float) -> float:
+    """One frame of the scene `stage` becomes `step` of what it was, or the nearest to it that two of Blender's numbers
+    say, within a two-thousandth: that is returned. InputError where they cannot."""
     render = stage.render
-    length = Fraction(render.frame_map_old, render.frame_map_new) * Fraction(step).limit_denominator(_LARGEST)
-    if (
-        max(length.numerator, length.denominator) > _LARGEST
-        or abs(Fraction(step).limit_denominator(_LARGEST) - Fraction(step)) * 100 > _OFF
-    ):
+    before = Fraction(render.frame_map_old, render.frame_map_new)
+    wanted = before * Fraction(step)
+    if not Fraction(1, _LARGEST) <= wanted <= _LARGEST:
         raise InputError(
             f"--every, --spread: motion vectors cannot lead over {step:g} frames in Blender; choose steps of at most "
             f"{_LARGEST}, or render with --no-passes."
         )
+    if wanted >= 1:
+        length = wanted.limit_denominator(int(_LARGEST / wanted))
+    else:
+        length = 1 / (1 / wanted).limit_denominator(int(_LARGEST * wanted))
     render.frame_map_old, render.frame_map_new = length.numerator, length.denominator
+    return float(length / before)
 
 
 def go_to(stage, frame: float, step: float = 1.0) -> None:
-    """Shows the scene's frame `frame`, whole or not, where a frame was made `step` long."""
+    """Shows the scene's frame `frame`, whole or not, where `lengthen_frames` returned `step`."""
     at = frame / step
     whole = math.floor(at + 1e-9)
     stage.frame_set(whole, subframe=max(at - whole, 0.0))
