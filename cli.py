@@ -12,14 +12,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from . import __version__
 from .datagen.sequence import InputError
 from .exit_codes import NOBODY_READS, exit_code
-
-if TYPE_CHECKING:
-    from .model.io.asset import LoadedAsset
 
 EPILOG = """the road, step by step:
   timesplat render fox.glb --out data/fox --rig alternating     24 posed images with depth and motion
@@ -297,134 +293,35 @@ def _bar() -> Iterator[Callable[[float, str], None]]:
         yield progress
 
 
-# ---------------------------------------------------------------- export, extension
+# ---------------------------------------------------------------- export, view
 
 
 def export_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote, or another "
-                   "file of Gaussians: 3DGS .ply, .splat, .spz, USD; or a folder with a .ply a frame")  # fmt: skip
-    p.add_argument(
-        "out",
-        type=Path,
-        nargs="?",
-        help=".usdc, .usda, .usdz, .ply, .html (a page that plays it), .blend to write; "
-        ".splat, .spz, .glb with --frame",
-    )
-    _up_argument(p)
-    p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
-                   "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
-    p.add_argument("--half", action="store_true", help="USD: half precision")
-    p.add_argument("--original", type=Path, help="USD: file of the original object, for a variant set")
-    p.add_argument("--original-start", type=float, help="its frame at the clip's first frame (default: the same frame)")
-    p.add_argument("--pieces", action="store_true", help="write straight 4D Gaussians in place of tracks, for readers "
-                   "that know no paths")  # fmt: skip
-    p.add_argument("--check", action="store_true", help="USD: exit with 1 if the validator complains")
-    p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply, .splat, .spz or .glb")
-    p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a 3DGS .ply a frame into a new folder")
+    from .model.io.export import add_export_arguments
+
+    add_export_arguments(p)
 
 
 def export(args: argparse.Namespace) -> int:
     """Export an asset: USD (Gaussian splats that older readers take as points), a web page that plays it, 3DGS .ply
     slices, or a .blend."""
-    import tempfile
+    from .model.io.export import export as run
 
-    from .model.io.files import WRITABLE, write_asset
-    from .model.io.slice_formats import SLICE_FORMATS
-    from .model.io.slices import write_slices
-    from .model.io.usd_check import check_usd
-    from .model.io.usd_stage import USD_SUFFIXES
-
-    suffix = args.out.suffix.lower() if args.out else ""
-    usd = suffix in USD_SUFFIXES
-    if (args.out is None) == (args.sequence is None):
-        raise InputError("export: name one file to write, or a folder by --sequence.")
-    if not usd and (args.mode != "splats" or args.half or args.original or args.check):
-        raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
-    if args.frame is not None and (usd or args.sequence):
-        raise InputError("export: --frame is for one moment's file, as .ply or .splat; drop it.")
-    if args.pieces and (args.sequence or args.frame is not None):
-        raise InputError("export: --pieces is for what has time, not for moments; drop it.")
-    loaded = _read(args.asset, args.up)
-    asset, count = loaded.asset, len(loaded.asset)
-    if loaded.motion is not None and not usd:
-        print(f"{args.asset}: it moves as a whole; what is written stands where that starts, USD would keep it")
-    if args.sequence:
-        print(f"{args.sequence}: {write_slices(args.sequence, asset, args.asset.stem)} files")
-        return 0
-    if suffix == ".blend" and args.frame is None:
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            ply = Path(folder) / f"{args.asset.stem}.ply"
-            count = write_asset(ply, asset, pieces=args.pieces)
-            save_blend(ply, args.out)
-    elif suffix not in WRITABLE and args.frame is None and suffix in SLICE_FORMATS:
-        raise InputError(f"{args.out}: {suffix} holds one moment; say which by --frame.")
-    elif suffix not in WRITABLE and args.frame is None:
-        raise InputError(f"{args.out}: cannot write that; choose {', '.join(WRITABLE)} or .blend.")
-    else:
-        options = {}
-        if usd:
-            options = {"mode": args.mode, "half": args.half, "motion": loaded.motion}
-            options |= {"original": args.original, "original_start": args.original_start}
-        count = write_asset(args.out, asset, frame=args.frame, pieces=args.pieces, **options)
-    print(f"{args.out}: {count} Gaussians, {args.out.stat().st_size / 1e6:.1f} MB")
-    complaints = check_usd(args.out) if usd else []
-    for complaint in complaints:
-        print(f"  {complaint}")
-    if usd and not complaints:
-        print("  the validator has no complaints")
-    return 1 if args.check and complaints else 0
-
-
-def _read(path: Path, up: str | None) -> LoadedAsset:
-    """What a file holds, turned so that Z is up in place of `up`; what is to be said of it is printed."""
-    from .model.io.files import read_asset, upright
-
-    loaded = read_asset(path)
-    if loaded.note:
-        print(f"{path}: {loaded.note}")
-    if loaded.up != "Z" and not up:
-        print(f"{path}: {loaded.up} is up in it, as far as is known; it is turned so that Z is. --up says otherwise")
-    return replace(loaded, asset=upright(loaded, up), up="Z")
-
-
-def _up_argument(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--up", choices=["Z", "Y", "-Y"], help="what points up in the file (default: Z in Timesplat's own "
-                   "and in USD, Y in .spz, -Y in other .ply and .splat, which say nothing, as in captures that 3DGS "
-                   "is trained on)")  # fmt: skip
-
-
-def save_blend(asset: Path, out: Path) -> None:
-    """The asset as a .blend that plays without the add-on; Blender runs in a process of its own."""
-    import subprocess
-
-    command = [sys.executable, "-m", "timesplat.addon.asset.blend_file", str(asset), str(out)]
-    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
-    if done.returncode:
-        reason = (done.stderr.strip() or done.stdout.strip() or "Blender stopped").splitlines()[-1]
-        raise InputError(f"{out}: the .blend was not written: {reason}")
+    return run(args)
 
 
 def view_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", type=Path, help="what `timesplat export` reads: .ply, .splat, .spz, USD, .html, or a "
-                   "folder with a .ply a frame")  # fmt: skip
-    _up_argument(p)
+    from .model.io.export import add_view_arguments
+
+    add_view_arguments(p)
 
 
 def view(args: argparse.Namespace) -> int:
     """Play an asset in the browser: writes the page of `timesplat export ASSET NAME.html` to a temporary file and opens
     it. Nothing is served, and nothing leaves the machine."""
-    import tempfile
-    import webbrowser
+    from .model.io.export import view as run
 
-    from .model.io.files import write_asset
-
-    asset = _read(args.asset, args.up).asset
-    page = Path(tempfile.mkdtemp(prefix="timesplat-")) / f"{args.asset.resolve().stem}.html"
-    write_asset(page, asset)
-    print(f"{page}: {len(asset)} Gaussians, {page.stat().st_size / 1e6:.1f} MB")
-    if not webbrowser.open(page.as_uri()):
-        print("no browser was found; open the page in one")
-    return 0
+    return run(args)
 
 
 # ---------------------------------------------------------------- evaluate, bench, demo
@@ -488,6 +385,7 @@ def demo_arguments(p: argparse.ArgumentParser) -> None:
 def demo(args: argparse.Namespace) -> int:
     """Render an animated object, reconstruct it several ways, export it, and lay everything side by side."""
     from .evaluation.demo import DemoOptions, demo
+    from .model.io.export import save_blend
 
     return demo(options_of(DemoOptions, args), save_blend)
 
