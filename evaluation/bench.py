@@ -35,13 +35,22 @@ class Axes:
     centre: tuple[str, ...] = (
         *("lift", "guided", "rgb", "predicted", "gs-lrm-all", "gs-lrm-frame", "hull"),
         *("guided+dense", "rgb+dense", "predicted+dense"),
-        *(f"{name}:{s}" for name in ("tracks", "4dgs", "som") for s in (1, 3, 10, 30)),
+        *(f"{name}:{s}" for name in ("tracks", "deform", "4dgs", "som") for s in (1, 3, 10, 30)),
         *(f"{name}+refine:{s}" for name in ("guided", "rgb") for s in (1, 3, 10, 30)),
         *(f"rgb+refine:{s}" for s in (0.1, 0.3, 0.6, 2)),
         *(f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in ("2.5%", "5%", "10%", "25%", "auto")),
         *(f"rgb+refine:3+budget:{n}" for n in (500, 1000, "auto")),
     )
-    elsewhere: tuple[str, ...] = ("tracks:3", "lift", "guided", "rgb", "guided+refine:3", "rgb+refine:3", "4dgs:3")
+    elsewhere: tuple[str, ...] = (
+        "tracks:3",
+        "deform:3",
+        "lift",
+        "guided",
+        "rgb",
+        "guided+refine:3",
+        "rgb+refine:3",
+        "4dgs:3",
+    )
     quick: float = 3.0  # seconds of fitting that a quick run has at the most
 
 
@@ -59,6 +68,7 @@ class BenchOptions:
     quick: bool = False
     methods: str | None = None
     renderer: bool = False
+    scaling: bool = False
     size: int = 128
     jobs: int = 2
     limit: float | None = None
@@ -80,6 +90,9 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--methods", help="only these, at the centre: comma-separated, written as in bench.csv, for "
                    "example guided,4dgs:10,rgb+refine:3")  # fmt: skip
     p.add_argument("--renderer", action="store_true", help="only the chart of the renderer: some 2 minutes")
+    p.add_argument("--scaling", action="store_true", help="instead: what methods make of more views, pixels and "
+                   "seconds, along three lines through 96 views, 256 pixels and 30 s; some 2 hours on 4 objects, "
+                   "with --quick 10 minutes on one")  # fmt: skip
     p.add_argument("--size", type=int, default=d.size, help="pixels to render at; 256 adds that size "
                    "(default: %(default)s)")  # fmt: skip
     p.add_argument("--jobs", type=int, default=d.jobs, help="processes, one core each (default: %(default)s)")
@@ -104,6 +117,10 @@ def bench(options: BenchOptions) -> int:
         measure_renderer(options.out / "bench-renderer.csv", options.jobs)
         print(options.out / f"{charts.draw_renderer(options.out / 'bench-renderer.csv')}.png")
         return 0
+    if options.scaling:
+        from .scaling import measure_scaling
+
+        return 2 if measure_scaling(options, started) else 0
     failures = measure(options, started)
     print(charts.draw(options.out / "bench.csv"))
     return 2 if failures else 0

@@ -35,7 +35,7 @@ FAMILIES = {
     "predicted": PINK,
     "gs-lrm-all": YELLOW,
 }
-FAMILIES |= {"gs-lrm-frame": YELLOW, "hull": GREY, "white": GREY, "4dgs": GREEN, "som": SKY}
+FAMILIES |= {"gs-lrm-frame": YELLOW, "hull": GREY, "white": GREY, "4dgs": GREEN, "deform": SKY, "som": SKY}
 SEES = {True: "depth + motion", False: "RGB alone"}
 NAMES = {"seconds": "seconds of one thread", "gaussians": "Gaussians", "ply_mb": "megabytes of the .ply"}
 NAMES |= {"usd_mb": "megabytes of the .usdc"}

@@ -43,6 +43,7 @@ LAYERS = {
         ("evaluation.scoring",),
         ("evaluation.runner",),
         ("evaluation.tables", "evaluation.bench_summary", "evaluation.charts"),
+        ("evaluation.scaling",),
         (
             "evaluation.evaluate",
             "evaluation.bench",

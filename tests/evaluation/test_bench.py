@@ -186,7 +186,7 @@ def test_points_are_what_objects_allow(folders):
     points, notes = bench.plan(sequences)
     assert not any(p.method.has_depth for p in points) and "b has no depth" in notes[0]
     order = [(r.method.label, r.object) for r in runs_of(sequences, points)]
-    slowest = [(x, n) for n in "ab" for x in ("4dgs:30", "som:30", "rgb+refine:30")]
+    slowest = [(x, n) for n in "ab" for x in ("deform:30", "4dgs:30", "som:30", "rgb+refine:30")]
     assert order[-len(slowest) :] == slowest
 
 
