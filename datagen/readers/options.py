@@ -39,12 +39,15 @@ class ReadOptions:
     aabb: tuple[float, ...] | None = None  # x0 y0 z0 x1 y1 z1 of the volume, in the cameras' world
     scale: float | None = None  # half the volume's side, in the cameras' world, around what the cameras look at
     fps: float | None = None  # moments a second: so many are taken of videos, so many pictures have
+    scene: bool = False  # all that pictures show is wanted, whatever alpha, masks and backgrounds say
 
     def __post_init__(self) -> None:
         if self.axes is not None and self.axes not in AXES:
             raise InputError(f"--axes {self.axes}: no such convention; choose {', '.join(AXES)}.")
         if self.background != "auto":
             colour_of(self.background)
+            if self.scene:
+                raise InputError("--scene takes the background too; leave out --background.")
         if self.aabb is not None:
             low, high = np.array(self.aabb[:3]), np.array(self.aabb[3:])
             if len(self.aabb) != 6 or not (np.isfinite(self.aabb).all() and (low < high).all()):
@@ -60,6 +63,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     group = p.add_argument_group("what is read of others' data (found out by default)")
     group.add_argument("--background", default="auto", help="what is behind the object in pictures without alpha and "
                        "masks: white, black, green, #rrggbb, or auto: measured at the border (default)")  # fmt: skip
+    group.add_argument("--scene", action="store_true", help="reconstruct all that is seen, what lies far away too, and "
+                       "not the object alone (default where nothing tells the object)")  # fmt: skip
     group.add_argument("--axes", help=f"how cameras are written: {', '.join(AXES)} (default: as the layout has them)")
     group.add_argument("--times", metavar="PATTERN", help="a regular expression that finds the frame's number in a "
                        "picture's path, in brackets, and perhaps the (?P<camera>…); or none: one moment")  # fmt: skip

@@ -43,9 +43,18 @@ class Pictures:
     """How the pictures of a Sequence's views are read, by their path in it. The Sequence's size is the one
     that most have; others are resized to fit, and moved to its middle."""
 
-    def __init__(self, sources: dict[str, Source], background: Background | None, has_alpha: bool, remedy: str):
+    def __init__(
+        self,
+        sources: dict[str, Source],
+        background: Background | None,
+        has_alpha: bool,
+        remedy: str,
+        whole: bool = False,
+    ):
+        """whole: alpha is 1 everywhere, whatever pictures say. Masks are the sources' own."""
         sizes = [(s.lens.width, s.lens.height) for s in sources.values()]
         self.sources, self.background, self.has_alpha, self.remedy = sources, background, has_alpha, remedy
+        self.whole = whole
         self.width, self.height = max(dict.fromkeys(sizes), key=lambda s: (sizes.count(s), s))
 
     def __call__(self, view: View) -> np.ndarray:
@@ -76,6 +85,8 @@ class Pictures:
             rgba[..., 3] = np.rint(rgba[..., 3] * mask / 255)
         elif self.background and not self.has_alpha:
             rgba = key_out(rgba, self.background)
+        elif self.whole:
+            rgba[..., 3] = 255
         return rgba
 
     def _place(self, lens: Lens) -> tuple[float, float, float]:

@@ -100,8 +100,13 @@ def arrange(scene: PosedScene, options: ReadOptions) -> Sequence:
     if not scene.pictures:
         raise InputError(f"{scene.path}: it has no pictures; {REMEDY}.")
     sources, has_alpha, masked = _sources(scene)
-    background, behind = background_of(list(sources.values()), masked, has_alpha, options.background, REMEDY)
-    pictures = Pictures(sources, background, has_alpha or masked, REMEDY)
+    if options.scene:
+        sources = {name: replace(s, mask=None) for name, s in sources.items()}
+        pictures = Pictures(sources, None, False, REMEDY, whole=True)
+        behind = "the whole scene is reconstructed, what lies far outside of the volume too, as --scene says"
+    else:
+        background, behind = background_of(list(sources.values()), masked, has_alpha, options.background, REMEDY)
+        pictures = Pictures(sources, background, has_alpha or masked, REMEDY)
     told = [f"{scene.layout}: {len(scene.pictures)} pictures", *scene.notes, *_lens_notes(sources, pictures), behind]
 
     names, cameras = [p.image for p in scene.pictures], [p.camera for p in scene.pictures]

@@ -247,6 +247,16 @@ def test_the_volume_can_be_told(tmp_path, taken):
     assert open_sequence(tmp_path, ReadOptions(scale=7)).normalisation.scale == 7
 
 
+def test_the_whole_scene_if_it_is_asked_for(tmp_path, taken):
+    write_pictures(tmp_path, taken)
+    write_transforms(tmp_path, taken)
+    alone, whole = open_sequence(tmp_path), open_sequence(tmp_path, ReadOptions(scene=True))
+    assert alone.load_image(3)[..., 3].min() == 0 and whole.load_image(3)[..., 3].min() == 255
+    assert any("as --scene says" in x for x in whole.provenance["read"])
+    with pytest.raises(InputError, match="leave out --background"):
+        ReadOptions(scene=True, background="white")
+
+
 def test_without_anything_that_tells_the_object(tmp_path, taken):
     rng = np.random.default_rng(0)
     for k in range(12):
