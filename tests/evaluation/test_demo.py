@@ -21,9 +21,9 @@ def out(tmp_path_factory):
 
 def test_demo_writes_what_it_promises(out):
     metrics = json.loads((out / "metrics.json").read_text())
-    assert set(metrics["methods"]) == {"white", "hull", "lift", "guided", "guided+budget:10%", "tracks:5", "deform:10"}
+    assert set(metrics["methods"]) == {"white", "hull", "lift", "guided", "guided+budget:10%", "tracks:5", "deform+steps:600"}
     assert all(set(m) >= KEYS for m in metrics["methods"].values())
-    assert set(metrics["seconds"]) >= {"rendering", "lift", "guided", "deform:10", "export"}
+    assert set(metrics["seconds"]) >= {"rendering", "lift", "guided", "deform+steps:600", "export"}
     assert metrics["methods"]["lift"]["psnr"] > metrics["methods"]["hull"]["psnr"]
     assert Image.open(out / "comparison.png").width > 300
     with Image.open(out / "turntable.webp") as film:
