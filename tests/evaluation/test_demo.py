@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from timesplat.cli import main
+from timesplat.evaluation.demo import METHODS
 from timesplat.model.io.ply import read_ply
 from timesplat.model.io.usd_read import read_usd
 
@@ -21,7 +22,7 @@ def out(tmp_path_factory):
 
 def test_demo_writes_what_it_promises(out):
     metrics = json.loads((out / "metrics.json").read_text())
-    assert set(metrics["methods"]) == {"white", "hull", "lift", "guided", "guided+budget:10%", "tracks:5", "deform+steps:600"}
+    assert set(metrics["methods"]) == set(METHODS)
     assert all(set(m) >= KEYS for m in metrics["methods"].values())
     assert set(metrics["seconds"]) >= {"rendering", "lift", "guided", "deform+steps:600", "export"}
     assert metrics["methods"]["lift"]["psnr"] > metrics["methods"]["hull"]["psnr"]
