@@ -25,7 +25,7 @@ from ..fitting.quality import Quality
 from ..fitting.refine import part
 from ..geometry.silhouettes import points_inside
 from ..geometry.surface_tracks import pixel_size
-from ..geometry.surroundings import is_whole, points_around
+from ..geometry.surroundings import EDGE, is_whole, points_around
 from ..tracks import Tracks4D
 from ..views import Views
 from .cloud import SEEN, ControlPoints, DeformingCloud
@@ -36,7 +36,6 @@ LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
 PER_PIXEL = 4  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view
 MAX_GAUSSIANS = 100_000
-FARTHEST = 2.0  # where contracted space ends
 SCENE_START = 10_000  # Gaussians at the start of a whole scene
 
 
@@ -152,7 +151,7 @@ class _Fit:
 
     def _densifier(self) -> Densifier:
         return Densifier(
-            self.parameters, self.generator, self.stage.gaussians, self.stage.pace, FARTHEST if self.whole else OUTSIDE
+            self.parameters, self.generator, self.stage.gaussians, self.stage.pace, EDGE if self.whole else OUTSIDE
         )
 
     def cloud(self) -> DeformingCloud:

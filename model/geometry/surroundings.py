@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..views import Views, rays
 
+EDGE = 2.0  # radius at which contracted space ends
 FARTHEST = 50.0  # where points are looked for, in the volume's half sides
 WHOLE = 0.9  # share of the pixels that show something, from which on there is no object apart from what is around it
 DEPTHS = 48  # that are tried along a ray, as even in contracted space as can be
@@ -28,7 +29,7 @@ def expanded(contracted: Tensor) -> tuple[Tensor, Tensor]:
     """Places (N,3) in contracted space, within a ball of radius 2 -> the places (N,3), and by how much what is small
     there is larger (N,1), seen from the middle."""
     r = contracted.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    out = 1 / (2 - r.clamp(max=2 - 1 / (2 * FARTHEST)))
+    out = 1 / (EDGE - r.clamp(max=EDGE - 1 / (2 * FARTHEST)))
     larger = torch.where(r > 1, out / r, torch.ones_like(r))
     return contracted * larger, larger
 
@@ -36,7 +37,7 @@ def expanded(contracted: Tensor) -> tuple[Tensor, Tensor]:
 def contracted(places: Tensor) -> Tensor:
     """(N,3) -> (N,3), of which `expanded` makes the places again."""
     r = places.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    return torch.where(r > 1, places * (2 - 1 / r) / r, places)
+    return torch.where(r > 1, places * (EDGE - 1 / r) / r, places)
 
 
 def points_around(views: Views, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
