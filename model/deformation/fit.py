@@ -50,7 +50,7 @@ class DeformFit:
     opacity: tuple[float, float] = (5e-2, 5e-3)
     motion: tuple[float, float] = (0.08, 0.0036)  # in steps of a frame in model time: the more frames, the slower
     start: int = 1000  # Gaussians at the start
-    first_views: int = 8  # nearest to the middle of the clip, which say where these are
+    first_views: int = 8  # nearest to the middle of the clip, or all of one moment, which say where these are
     start_opacity: float = 0.1
     window: float = 0.4  # share of the schedule after which all of the clip is looked at
     front: float = 0.5  # of the views until then are of the moments that came in last
@@ -104,13 +104,12 @@ class _Fit:
         self.stage = self.stages[0]
         self.generator = torch.Generator().manual_seed(seed)
         self.sharp = SHARP[len(views) >= SEVERAL * len(views.time.unique())]
-        middle = views[views.time.abs().argsort(stable=True)[: fit.first_views]]
+        order = views.time.abs().argsort(stable=True)
+        at_once = int((views.time == views.time[order[0]]).sum())
+        middle = views[order[: max(fit.first_views, at_once)]]
         self.whole = is_whole(views)
-        if self.whole:
-            near = views.time.abs() <= middle.time.abs().max() + 1e-6
-            xyz, rgb = points_around(views[near], min(SCENE_START, self.stage.gaussians), self.generator)
-        else:
-            xyz, rgb = points_inside(middle, min(fit.start, self.stage.gaussians), self.generator)
+        points, most = (points_around, SCENE_START) if self.whole else (points_inside, fit.start)
+        xyz, rgb = points(middle, min(most, self.stage.gaussians), self.generator)
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
         first, last = fit.xyz

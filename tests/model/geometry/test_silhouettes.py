@@ -37,3 +37,19 @@ def test_where_nothing_is_seen_they_are_anywhere():
     views.alpha = torch.zeros_like(views.alpha)
     xyz, _ = points_inside(views, 300, torch.Generator().manual_seed(0))
     assert len(xyz) == 300 and xyz.abs().max() <= HALF_SIDE and xyz.std() > 0.5
+
+
+def test_where_no_camera_looks_at_the_volume_they_are_anywhere():
+    views = ball_views()
+    views.intrinsics = views.intrinsics - torch.tensor([0.0, 0, 480, 0])
+    assert len(points_inside(views, 300, torch.Generator().manual_seed(0))[0]) == 300
+
+
+def test_what_lies_outside_of_half_of_the_frames_is_found_too():
+    """Half of the cameras are turned so far that they see nothing of the object."""
+    views = ball_views()
+    turned = torch.arange(len(views)) % 2 == 1
+    views.intrinsics = views.intrinsics - 10 * views.size[1] * turned[:, None] * torch.tensor([0.0, 0, 1, 0])
+    views.alpha[turned] = 0.0
+    xyz, _ = points_inside(views, 500, torch.Generator().manual_seed(0))
+    assert (xyz - torch.tensor([0.3, 0, 0])).norm(dim=-1).max() < 0.45
