@@ -21,9 +21,12 @@ def geometry_for(source: str, views: Views):
     return None
 
 
-def apply_network(network, views: Views, device: str = "cpu", drop_empty: bool = True) -> Gaussians4D:
+def apply_network(network, views: Views, device: str = "cpu", drop_empty=True, progress=None) -> Gaussians4D:
     """Views of any size -> what the network, which is on `device`, makes of them and of their Geometry, on the CPU.
-    drop_empty: tokens only where the object is."""
+    drop_empty: tokens only where the object is. `progress(fraction, text)` is called before each of the two."""
+    report = progress or (lambda fraction, text: None)
     views = pad_to_multiple(views, network.config.patch)
+    report(0.0, "looking for surfaces")
     geometry = geometry_for(network.config.source, views)
+    report(0.5, "network")
     return network(views.to(device), geometry and geometry.to(device), drop_empty).to("cpu")

@@ -78,6 +78,7 @@ class Method:
     checkpoint: str | None = None  # name of the shipped weights that it loads
     quality: str | None = None  # that is meant where nothing says how long it shall fit, in place of seconds
     knows_surface: bool = False  # its Gaussians know which way their surface faces
+    most_pixels: int | None = None  # that show the object, of all views; from smaller pictures where there are more
 
 
 METHODS: dict[str, Method] = {}
@@ -117,8 +118,9 @@ def run_deform(views: Views, options: ReconstructOptions, progress: Progress | N
     return reconstruct_deform(views, seconds, steps=options.steps, quality=options.named_quality, **told)
 
 
-def load_predictor(options: ReconstructOptions) -> Callable[[Views], Gaussians4D]:
-    """The network of options.checkpoint, from Views to Gaussians. Raises InputError as `load_network` does."""
+def load_predictor(options: ReconstructOptions) -> Callable[..., Gaussians4D]:
+    """The network of options.checkpoint, from Views (and `progress`) to Gaussians. Raises InputError as `load_network`
+    does."""
     from .checkpoints_io import load_network
     from .inference import apply_network
 
@@ -127,7 +129,10 @@ def load_predictor(options: ReconstructOptions) -> Callable[[Views], Gaussians4D
 
 
 def run_network(views: Views, options: ReconstructOptions, progress: Progress | None) -> Gaussians4D:
-    return load_predictor(options)(views)
+    return load_predictor(options)(views, progress=progress)
+
+
+SWEPT = 1_500_000  # pixels, each of which becomes a Gaussian: 40 s and 3 GB of two cores
 
 
 register(
@@ -160,6 +165,7 @@ register(
         run_network,
         checkpoint="sweep",
         knows_surface=True,
+        most_pixels=SWEPT,
     ),
     Method(
         "sweep",
@@ -167,6 +173,7 @@ register(
         run_network,
         checkpoint="sweep",
         knows_surface=True,
+        most_pixels=SWEPT,
     ),
     Method(
         "deform",

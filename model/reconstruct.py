@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -11,11 +13,12 @@ from ..datagen.sequence import InputError, Sequence
 from .checkpoints_io import CHECKPOINTS
 from .devices import fitting_device
 from .gaussians import Gaussians4D, ReconstructedScene
-from .methods import Progress, ReconstructOptions, method_named
+from .methods import Method, Progress, ReconstructOptions, method_named
 from .tracks import Tracks4D
 from .views import Views, load_views, shrink
 
 DEFAULTS = ReconstructOptions()
+Scene = Gaussians4D | ReconstructedScene
 
 
 def default_method(sequence: Sequence, indices=None) -> str:
@@ -48,7 +51,7 @@ def reconstruct(
     options: ReconstructOptions = DEFAULTS,
     progress: Progress | None = None,
     size: int | None = None,
-) -> Gaussians4D | ReconstructedScene:
+) -> Scene:
     """Views `indices` of the Sequence (all of them by default), at `size` pixels (see `load_views`), by a method
     (`default_method` where none is named) -> the scene (N,), Gaussians filtered out that the paper's inference filters
     would never draw. `progress(fraction, text)` is called between steps.
@@ -72,11 +75,16 @@ def reconstruct(
 
 def reconstruct_views(
     views: Views, method: str, options: ReconstructOptions = DEFAULTS, progress: Progress | None = None
-) -> Gaussians4D | ReconstructedScene:
+) -> Scene:
     """The same from tensors; unfiltered. `progress(fraction, text)` is called by what takes seconds."""
     quality = options.named_quality
     by = -(-max(views.size) // quality.size) if quality else 1
-    scene = _reconstruct(shrink(views, by), method, options, progress)
+    return _from_smaller(views, by, lambda smaller: _reconstruct(smaller, method, options, progress))
+
+
+def _from_smaller(views: Views, by: int, run: Callable[[Views], Scene]) -> Scene:
+    """What `run` makes of the views at 1/by of their size, to be drawn at their own."""
+    scene = run(shrink(views, by))
     if by > 1 and isinstance(scene, Gaussians4D | Tracks4D):
         from .geometry.surface_tracks import pixel_size
         from .rasterize.constants import BLUR
@@ -87,15 +95,22 @@ def reconstruct_views(
     return scene
 
 
-def _reconstruct(
-    views: Views, method: str, options: ReconstructOptions, progress: Progress | None
-) -> Gaussians4D | ReconstructedScene:
+def _run(chosen: Method, views: Views, options: ReconstructOptions, progress: Progress | None) -> Scene:
+    """The method over the views, made smaller where they show more than it can make a Gaussian of each pixel of."""
+    shown = float((views.alpha > 0).sum())
+    by = math.ceil(math.sqrt(shown / chosen.most_pixels)) if chosen.most_pixels and shown else 1
+    if by > 1 and progress:
+        progress(0.0, f"{chosen.name} from pictures at 1/{by} of their size")
+    return _from_smaller(views, by, lambda smaller: chosen.run(smaller, options, progress))
+
+
+def _reconstruct(views: Views, method: str, options: ReconstructOptions, progress: Progress | None) -> Scene:
     chosen = method_named(method)
     if chosen.checkpoint and not options.checkpoint:
         options = replace(options, checkpoint=CHECKPOINTS / f"{chosen.checkpoint}.safetensors")
     counted = options.counted and not chosen.fits  # those that fit a scene have taken these steps by then
     if chosen.budgets or not (options.refine or options.budget or counted):
-        return chosen.run(views, options, progress)
+        return _run(chosen, views, options, progress)
 
     from .fitting.budget import apply_budget
     from .fitting.refine import Few, refine, start_size
@@ -103,7 +118,7 @@ def _reconstruct(
     device = fitting_device(options.device)
     # What is merged into a few thousand Gaussians may start from small pictures, in a quarter of the time.
     as_given = chosen.has_depth or chosen.fits or "%" in (options.budget or "")
-    start = chosen.run(views if as_given else start_size(views), options, None)
+    start = _run(chosen, views if as_given else start_size(views), options, None)
     told = {"has_depth": chosen.has_depth, "device": device, "seed": options.seed, "progress": progress}
     told["steps"], most = options.steps, None
     if quality := options.named_quality:

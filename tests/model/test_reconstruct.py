@@ -9,7 +9,7 @@ import torch
 
 from timesplat.datagen.sequence import InputError, read_sequence
 from timesplat.model import baselines  # noqa: F401, adds its methods
-from timesplat.model.methods import ReconstructOptions
+from timesplat.model.methods import METHODS, ReconstructOptions
 from timesplat.model.network import Config
 from timesplat.model.reconstruct import chosen_method, reconstruct, untracked_note
 
@@ -65,6 +65,14 @@ def test_rgb_methods_read_no_passes(sphere_folder, tmp_path):
     assert len(reconstruct(seq, "rgb", range(24))) > 500
     with pytest.raises(InputError, match="has no depth pass"):
         reconstruct(seq, "lift", range(24))
+
+
+def test_a_gaussian_a_pixel_is_made_of_smaller_pictures_where_pixels_are_too_many(sphere_folder, monkeypatch):
+    seq, told = read_sequence(sphere_folder), []
+    whole = reconstruct(seq, "rgb", range(24))
+    monkeypatch.setitem(METHODS, "rgb", replace(METHODS["rgb"], most_pixels=len(whole) // 3))
+    bounded = reconstruct(seq, "rgb", range(24), progress=lambda fraction, text: told.append(text))
+    assert len(bounded) < len(whole) / 2 and any("at 1/2 of their size" in text for text in told)
 
 
 def test_unknown_method_and_empty_views(sphere_folder, spheres, write_views, tmp_path):
