@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """As few paths as surface points need: points of one rigid part ride on one path, and a path has as few knots as keep
-it within a tolerance.
+it within a tolerance, at every frame and, where motion is smooth, of a smooth curve between them
+(`between_frames.py`).
 
-A path is that of one of the points. It takes all points along whose distance from where it would carry them stays
-within the tolerance at every frame; from few, spread over all, to more and more, until every point rides.
+A path is that of one of the points, or of its pivot. It takes all points along whose distance from where it would
+carry them stays within the tolerance at every frame; from few, spread over all, to more and more, until every point
+rides.
 """
 
 from __future__ import annotations
@@ -16,11 +18,14 @@ from torch import Tensor
 
 from ..rotations import conjugate, quaternion_multiply, rotate
 from ..tracks import Paths
+from .between_frames import pivots, smooth, smooth_turns
 
 FIRST_SEEDS = 24  # paths that are tried first
 SEED_SHARE = 0.12  # of the points that are left are tried as paths in each later round
 NEAREST = 4  # paths, by their place at one frame, of which each point takes the one that carries it best
 BLOCK = 4_000_000  # distances computed at a time
+STEPS = 4  # from frame to frame, at which a path is looked at
+BETWEEN = 2.0  # times the tolerance are allowed between frames
 
 
 def share_paths(place: Tensor, turn: Tensor, window: Tensor, tolerance: float, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -91,15 +96,43 @@ def _carried(x: Tensor, q: Tensor, points: Tensor, seeds: Tensor) -> tuple[Tenso
 def knots(place: Tensor, turn: Tensor, window: Tensor, reach: Tensor, tolerance: float) -> Paths:
     """place (P,F,3), turn (P,F,4) at the F frames of a clip, window (P,2) the first and last frame of each, reach (P,)
     how far away from its place what rides on it is -> paths of as few evenly spaced knots as keep all of it within
-    the tolerance at every frame. What comes or goes within the clip is there for half a frame more."""
+    the tolerance at every frame, and BETWEEN times that between. What comes or goes within the clip is there for half a
+    frame more."""
     n, frames = place.shape[:2]
     if frames == 1:
         ends = place.new_ones(n)
         return Paths(-ends, ends, torch.ones(n, dtype=torch.long), place[:, 0], turn[:, 0])
+    count, found = torch.zeros(n, dtype=torch.long), []  # found: paths, knots' places, knots' rotations
+    for part in torch.arange(n).split(max(BLOCK // (STEPS * frames * 3), 1)):
+        for who, p, q in _fewest(place[part], turn[part], window[part], reach[part], tolerance):
+            found.append((part[who], p, q))
+            count[part[who]] = p.shape[1]
+    start = count.cumsum(0) - count
+    at_place, at_turn = place.new_zeros(int(count.sum()), 3), place.new_zeros(int(count.sum()), 4)
+    for who, p, q in found:
+        rows = (start[who, None] + torch.arange(p.shape[1])).flatten()
+        at_place[rows], at_turn[rows] = p.flatten(0, 1), q.flatten(0, 1)
+    first, last = _ends(window, frames, 1)
+    time = 2 / (frames - 1)
+    return Paths(first * time - 1, last * time - 1, count, at_place, at_turn)
+
+
+def _ends(window: Tensor, frames: int, steps: int) -> tuple[Tensor, Tensor]:
+    """(P,) each: from when to when what has these windows (P,2) is there, in steps, so many of which are a frame."""
     first = torch.where(window[:, 0] > 0, window[:, 0] - 0.5, 0.0)
-    last = torch.where(window[:, 1] < frames - 1, window[:, 1] + 0.5, frames - 1.0)
-    left, count = torch.arange(n), torch.zeros(n, dtype=torch.long)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []  # paths, knots' places, knots' rotations
+    return steps * first, steps * torch.where(window[:, 1] < frames - 1, window[:, 1] + 0.5, frames - 1.0)
+
+
+def _fewest(
+    place: Tensor, turn: Tensor, window: Tensor, reach: Tensor, tolerance: float
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """As `knots` -> paths (n,) for which so many knots are enough, these knots' places (n,k,3) and rotations (n,k,4),
+    for each number of knots."""
+    frames = place.shape[1]
+    first, last = _ends(window, frames, STEPS)
+    place, turn = smooth(place, window, STEPS), smooth_turns(turn, window, STEPS)
+    window, left = STEPS * window, torch.arange(len(place))
+    found = []
     for tried in _counts(frames):
         at = first[left, None] + (last - first)[left, None] * torch.linspace(0, 1, tried)
         p, q = _between(place, turn, left, at if tried > 1 else 0.5 * (first + last)[left, None])
@@ -107,28 +140,21 @@ def knots(place: Tensor, turn: Tensor, window: Tensor, reach: Tensor, tolerance:
         if tried == _counts(frames)[-1]:
             good[:] = True
         found.append((left[good], p[good], q[good]))
-        count[left[good]] = tried
         left = left[~good]
         if not len(left):
             break
-    start = count.cumsum(0) - count
-    at_place, at_turn = place.new_zeros(int(count.sum()), 3), place.new_zeros(int(count.sum()), 4)
-    for who, p, q in found:
-        rows = (start[who, None] + torch.arange(p.shape[1])).flatten()
-        at_place[rows], at_turn[rows] = p.flatten(0, 1), q.flatten(0, 1)
-    time = 2 / (frames - 1)
-    return Paths(first * time - 1, last * time - 1, count, at_place, at_turn)
+    return found
 
 
 def _counts(frames: int) -> list[int]:
-    """Numbers of knots that are tried; the last one has a knot at every frame and between."""
+    """Numbers of knots that are tried; the last one has a knot at every step."""
     fewer = [k for k in (1, 2, 3, 4, 5, 7, 9, 12, 16, 24, 36, 48, 96, 144, 192) if k < frames]
-    return [*fewer, frames, 2 * frames - 1]
+    return [*fewer, *(n * (frames - 1) + 1 for n in (1, 2, STEPS))]
 
 
 def _between(place: Tensor, turn: Tensor, who: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """The paths `who` (n,) at the (n,k) frames `at`, fractions too -> (n,k,3), (n,k,4); of what comes or goes within
-    the clip the frames beyond hold its end."""
+    """The paths `who` (n,) at the (n,k) steps `at`, fractions too -> (n,k,3), (n,k,4); of what comes or goes within
+    the clip the steps beyond hold its end."""
     a = at.floor().long().clamp(0, place.shape[1] - 1)
     b = (a + 1).clamp_max(place.shape[1] - 1)
     part = (at - a)[..., None]
@@ -153,11 +179,12 @@ def _distance(
     q: Tensor,
 ) -> Tensor:
     """(n,) how far the paths `who`, with knots p (n,k,3), q (n,k,4), are from where they should be, at most, at the
-    frames of their windows: by place, and by rotation at the distance `reach`. Signs of q are made to agree."""
+    steps of their windows: by place, and by rotation at the distance `reach`; between frames by BETWEEN less. Signs
+    of q are made to agree."""
     for i in range(1, q.shape[1]):
         q[:, i] *= torch.where((q[:, i] * q[:, i - 1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    frames = torch.arange(place.shape[1], dtype=place.dtype)
-    along = ((frames - first[who, None]) / (last - first)[who, None].clamp_min(1e-6)).clamp(0, 1) * (p.shape[1] - 1)
+    steps = torch.arange(place.shape[1], dtype=place.dtype)
+    along = ((steps - first[who, None]) / (last - first)[who, None].clamp_min(1e-6)).clamp(0, 1) * (p.shape[1] - 1)
     a = along.floor().clamp_max(max(p.shape[1] - 2, 0)).long()
     b = (a + 1).clamp_max(p.shape[1] - 1)
     part = (along - a)[..., None]
@@ -166,7 +193,8 @@ def _distance(
     apart = _slerp(q[rows, a], q[rows, b], part)
     cosine = (apart * turn[who]).sum(-1).abs().clamp_max(1)
     off = off + reach[who, None] * 2 * (1 - cosine.square()).clamp_min(0).sqrt()
-    inside = (frames >= window[who, :1]) & (frames <= window[who, 1:])
+    off = torch.where(steps % STEPS == 0, off, off / BETWEEN)
+    inside = (steps >= window[who, :1]) & (steps <= window[who, 1:])
     return (off * inside).amax(1)
 
 
@@ -177,6 +205,8 @@ def ride(place: Tensor, turn: Tensor, window: Tensor, tolerance: float) -> tuple
     carriers, path = owner.unique(return_inverse=True)
     middle = place.shape[1] // 2
     rotation = quaternion_multiply(conjugate(turn[owner, middle]), turn[:, middle])
+    place, turn, window = place[carriers], turn[carriers], window[carriers]
+    pivot = pivots(place, turn, window, tolerance)
+    place, offset = place + rotate(turn, pivot[:, None].expand_as(place)), offset - pivot[path]
     reach = place.new_zeros(len(carriers)).scatter_reduce(0, path, offset.norm(dim=-1), "amax")
-    paths = knots(place[carriers], turn[carriers], window[carriers], reach, tolerance)
-    return path, offset, rotation, paths
+    return path, offset, rotation, knots(place, turn, window, reach, tolerance)
