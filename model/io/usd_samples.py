@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,15 @@ MAX_STRAY = 5.0  # how far, in normalised units, an invisible point may be befor
 HOLD_SIGMAS = 4.0  # lifetimes after which a Gaussian stands still: exp(-½·4²) rounds to an opacity of 0
 EXTENT_SIGMAS = 3.0
 STRAIGHT = 1e-5  # by which a path may leave its chord, in normalised units, to be written as its two ends
+PARTS = 4  # that frames are cut into at the most, where straight lines from one to the next are too far from paths …
+BESIDE = 0.5  # … which is by so many σ of a Gaussian …
+FEW = 1e-3  # … for more than this share of what is there
 
 
 def positions(asset: Asset, every: bool, path: Path) -> dict[float, np.ndarray]:
     """{time code: (N,3)}: one sample if nothing moves, two if all go straight and no line leaves the box, else (or if
-    `every`) one a frame. Raises InputError, which names `path`, where they overflow."""
+    `every`) one a frame; unless `every`, two or PARTS where paths bend much between two frames. Raises InputError,
+    which names `path`, where they overflow."""
     samples = _of_lines(asset, every) if asset.paths is None else _of_paths(asset, every)
     if not all(np.isfinite(p).all() for p in samples.values()):
         raise InputError(f"{path}: velocity is so large that positions overflow; reconstruct it again.")
@@ -34,7 +39,32 @@ def _of_paths(asset: Asset, every: bool) -> dict[float, np.ndarray]:
         chords = ((p, first + np.float32((f - start) / (end - start)) * (last - first)) for f, p in samples.items())
         if not every and all((np.abs(p - q) < STRAIGHT).all() for p, q in chords):
             return {start: first, end: last}
-    return samples
+        return samples if every else _with_bends(asset, samples)
+
+
+def _with_bends(asset: Asset, samples: dict[float, np.ndarray]) -> dict[float, np.ndarray]:
+    """The samples of all frames, and of as many between as paths need."""
+    found, size = {}, asset.soft_scale().max(1)
+    for (code, a), b in zip(samples.items(), list(samples.values())[1:], strict=False):
+        here = {s: asset.at(asset.frame_to_time(code + s))[0] for s in (np.arange(1, PARTS) / PARTS).tolist()}
+        here |= {0.0: a, 1.0: b}
+        seen = asset.at(asset.frame_to_time(code + 0.5))[1] >= VISIBLE
+        parts = 1
+        while parts < PARTS and _beside(here, parts, seen, size) > FEW:
+            parts *= 2
+        found |= {code + i / parts: here[i / parts] for i in range(parts)}
+    return found | {code + 1.0: b}
+
+
+def _beside(here: dict[float, np.ndarray], parts: int, seen: np.ndarray, size: np.ndarray) -> float:
+    """The share of those seen (N,) whose places `here`, {part of a frame: (N,3)}, are more than BESIDE of their size
+    (N,) from straight lines between every 1/`parts` of a frame."""
+    far = np.zeros(len(size), bool)
+    for s, place in here.items():
+        before = min(np.floor(s * parts), parts - 1) / parts
+        line = here[before] + np.float32((s - before) * parts) * (here[before + 1 / parts] - here[before])
+        far |= np.linalg.norm(place - line, axis=1) > BESIDE * size
+    return float(far[seen].mean()) if seen.any() else 0.0
 
 
 def _of_lines(asset: Asset, every: bool) -> dict[float, np.ndarray]:
@@ -54,16 +84,18 @@ def _of_lines(asset: Asset, every: bool) -> dict[float, np.ndarray]:
     return ends
 
 
-def orientations(asset: Asset) -> dict[float, np.ndarray]:
-    """{time code: (N,4)}: one sample if nothing turns, else one a frame, from each to the next the shorter way."""
+def orientations(asset: Asset, codes: Iterable[float] = ()) -> dict[float, np.ndarray]:
+    """{time code: (N,4)}: one sample if nothing turns, else one a frame and at each of these time codes, from each to
+    the next the shorter way."""
     first = asset.clip.frame_start
     if asset.paths is None:
         return {float(first): asset.rotation}
     samples = {float(first): asset.rotation_at(asset.frame_to_time(first))}
-    for frame in asset.clip.frames[1:]:
-        turned = asset.rotation_at(asset.frame_to_time(frame))
-        agree = (turned * samples[frame - 1.0]).sum(1, keepdims=True) >= 0
-        samples[float(frame)] = np.where(agree, turned, -turned)
+    last = samples[float(first)]
+    for code in sorted({*map(float, asset.clip.frames), *codes} - {float(first)}):
+        turned = asset.rotation_at(asset.frame_to_time(code))
+        last = np.where((turned * last).sum(1, keepdims=True) >= 0, turned, -turned)
+        samples[code] = last
     still = all(np.array_equal(samples[first], q) for q in samples.values())
     return {float(first): asset.rotation} if still else samples
 

@@ -180,7 +180,7 @@ def _author(
     else:
         prim.put("positions", types.Point3fArray, points)
         prim.put_vectors(f"scales{prim.suffix}", prim.not_tiny(asset.soft_scale()))
-        prim.put_quaternions(f"orientations{prim.suffix}", orientations(asset))
+        prim.put_quaternions(f"orientations{prim.suffix}", orientations(asset, places))
         prim.put("opacities", types.FloatArray, opacities)  # stored once, with displayOpacity
         prim.put("radiance:sphericalHarmonicsDegree", types.Int, 0, uniform=True)
         prim.put_vectors(f"{SH_COEFFICIENTS}{prim.suffix}", (asset.rgb - 0.5) / SH_C0)
