@@ -44,7 +44,7 @@ def _of_paths(asset: Asset, every: bool) -> dict[float, np.ndarray]:
 
 def _with_bends(asset: Asset, samples: dict[float, np.ndarray]) -> dict[float, np.ndarray]:
     """The samples of all frames, and of as many between as paths need."""
-    found, size = {}, asset.soft_scale().max(1)
+    size, found = asset.soft_scale().max(1), dict[float, np.ndarray]()
     for (code, a), b in zip(samples.items(), list(samples.values())[1:], strict=False):
         here = {s: asset.at(asset.frame_to_time(code + s))[0] for s in (np.arange(1, PARTS) / PARTS).tolist()}
         here |= {0.0: a, 1.0: b}
