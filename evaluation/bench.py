@@ -68,6 +68,7 @@ class BenchOptions:
     quick: bool = False
     methods: str | None = None
     renderer: bool = False
+    recipe: bool = False
     scaling: bool = False
     size: int = 128
     jobs: int = 2
@@ -90,6 +91,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--methods", help="only these, at the centre: comma-separated, written as in bench.csv, for "
                    "example guided,4dgs:10,rgb+refine:3")  # fmt: skip
     p.add_argument("--renderer", action="store_true", help="only the chart of the renderer: some 2 minutes")
+    p.add_argument("--recipe", action="store_true", help="instead: the renderer against the field's recipe at equal "
+                   "PSNR, 512 pixels; some 20 minutes, with --quick one at 128 pixels")  # fmt: skip
     p.add_argument("--scaling", action="store_true", help="instead: what methods make of more views, pixels and "
                    "seconds, along three lines through 96 views, 256 pixels and 30 s; some 2 hours on 4 objects, "
                    "with --quick 10 minutes on one")  # fmt: skip
@@ -117,6 +120,12 @@ def bench(options: BenchOptions) -> int:
         measure_renderer(options.out / "bench-renderer.csv", options.jobs)
         print(options.out / f"{charts.draw_renderer(options.out / 'bench-renderer.csv')}.png")
         return 0
+    if options.recipe:
+        from .recipe import compare
+
+        compare(options.assets, options.out, quick=options.quick, jobs=options.jobs, command=options.command)
+        print(options.out / "recipe.md")
+        return 0
     if options.scaling:
         from .scaling import measure_scaling
 
@@ -130,7 +139,7 @@ def _check(options: BenchOptions) -> None:
     """Raises InputError for options that cannot be, and for what is not installed, before anything runs."""
     if not find_spec("matplotlib"):
         raise InputError("matplotlib is not installed; pip install 'timesplat[figures]'.")
-    if options.renderer and not find_spec("bpy"):
+    if (options.renderer or options.recipe) and not find_spec("bpy"):
         raise InputError("bpy is not installed; pip install 'timesplat[render]'.")
     for name in ("objects", "jobs"):
         if getattr(options, name) is not None and getattr(options, name) < 1:

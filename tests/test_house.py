@@ -43,7 +43,7 @@ LAYERS = {
         ("evaluation.scoring",),
         ("evaluation.runner",),
         ("evaluation.tables", "evaluation.bench_summary", "evaluation.charts"),
-        ("evaluation.scaling",),
+        ("evaluation.scaling", "evaluation.recipe"),
         (
             "evaluation.evaluate",
             "evaluation.bench",
@@ -87,6 +87,7 @@ LAYERS = {
             "benchmarks.blender_display",
             "benchmarks.network",
             "benchmarks.rasterizer",
+            "benchmarks.recipe",
             "benchmarks.renderer",
             "benchmarks.training",
             "benchmarks.usd",
