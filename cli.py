@@ -126,7 +126,7 @@ def import_(args: argparse.Namespace) -> int:
     return 0
 
 
-# ---------------------------------------------------------------- fetch, render, curate
+# ---------------------------------------------------------------- fetch, render, curate, pack
 
 
 def fetch_arguments(p: argparse.ArgumentParser) -> None:
@@ -165,6 +165,20 @@ def curate(args: argparse.Namespace) -> int:
     """Sort Sequences into the sets that training draws from, HQ4D, 4D and 3D, by how much they move, and throw out
     duplicates and artefacts: curation.csv, in which each decision can be overridden, and curation.html to look at."""
     from .datagen.curation.curate import run
+
+    return run(args)
+
+
+def pack_arguments(p: argparse.ArgumentParser) -> None:
+    from .datagen.shards import add_arguments
+
+    add_arguments(p)
+
+
+def pack(args: argparse.Namespace) -> int:
+    """Pack Sequences into WebDataset shards, from which `train` reads what it draws: pictures without loss, with or
+    without passes, each clip with its licence; and a manifest. What is packed already stays."""
+    from .datagen.shards import run
 
     return run(args)
 
@@ -417,6 +431,7 @@ COMMANDS = {
     "fetch": (fetch_arguments, fetch, "objects of Objaverse, with their licences"),
     "render": (render_arguments, render, "assets to Sequences (Blender)"),
     "curate": (curate_arguments, curate, "Sequences into sets for training, and out"),
+    "pack": (pack_arguments, pack, "Sequences into shards that train reads"),
     "inspect": (inspect_arguments, inspect, "what others' pictures and cameras are"),
     "import": (import_arguments, import_, "others' pictures to a Sequence"),
     "reconstruct": (reconstruct_arguments, reconstruct, "a Sequence to a 4D Gaussian asset"),

@@ -15,7 +15,12 @@ _MULTIPART = 0x1000
 
 
 def write_png(path: Path, rgba: np.ndarray) -> None:
-    """(H,W,4) uint8, straight alpha, marked as sRGB. Each row is stored as the difference to the one above."""
+    """(H,W,4) uint8, straight alpha, marked as sRGB."""
+    Path(path).write_bytes(encode_png(rgba))
+
+
+def encode_png(rgba: np.ndarray) -> bytes:
+    """What `write_png` writes. Each row is stored as the difference to the one above."""
     height, width, _ = rgba.shape
     rows = rgba.reshape(height, width * 4)
     up = rows - np.concatenate([np.zeros_like(rows[:1]), rows[:-1]])  # uint8 wraps, as the filter wants
@@ -24,7 +29,7 @@ def write_png(path: Path, rgba: np.ndarray) -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    Path(path).write_bytes(
+    return (
         b"\x89PNG\r\n\x1a\n"
         + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0))
         + chunk(b"sRGB", b"\0")

@@ -198,11 +198,12 @@ def write_sequence(seq: Sequence, folder: Path, fill: Callable[[Path], None]) ->
     folder = Path(folder)
     with whole_folder(folder, "transforms.json", "a Sequence") as tmp:
         fill(tmp)
-        (tmp / "transforms.json").write_text(json.dumps(_to_json(seq), indent=1))
+        (tmp / "transforms.json").write_text(json.dumps(sequence_to_json(seq), indent=1))
     return read_sequence(folder)
 
 
-def _to_json(seq: Sequence) -> dict:
+def sequence_to_json(seq: Sequence) -> dict:
+    """What `transforms.json` says of it."""
     frames = []
     for v in seq.views:
         f = {
@@ -262,40 +263,46 @@ def read_sequence(folder: Path) -> Sequence:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a folder that `timesplat render` wrote.")
     with read_from(path):
-        d = json.loads(path.read_text(encoding="utf-8"))
-        norm = d.get("normalisation", {})
-        x, y, z = norm.get("translation", (0, 0, 0))
-        frames = [frame_number(f["frame"]) for f in d["frames"]]
-        seq = Sequence(
-            width=int(d["w"]),
-            height=int(d["h"]),
-            fps=float(d.get("fps", 24.0)),
-            frame_start=int(d.get("frame_start", math.floor(min(frames, default=0)))),
-            frame_end=int(d.get("frame_end", math.ceil(max(frames, default=0)))),
-            normalisation=Normalisation(float(norm.get("scale", 1.0)), (float(x), float(y), float(z))),
-            aabb=d.get("aabb", [[-1, -1, -1], [1, 1, 1]]),
-            provenance=d.get("provenance", {}),
-            tracks=d.get("tracks_path"),
-            untracked=[str(name) for name in d.get("untracked", [])],
-            root=folder,
-        )
-        for frame, f in zip(frames, d["frames"], strict=True):
-            fx, fy = focal_lengths(d | f, seq.width)
-            seq.views.append(
-                View(
-                    frame=frame,
-                    camera=str(f.get("camera", "0")),
-                    rig=str(f.get("rig", "")),
-                    c2w=np.array(f["transform_matrix"], dtype=np.float64),
-                    fx=fx,
-                    fy=fy,
-                    cx=float(f.get("cx", d.get("cx", seq.width / 2))),
-                    cy=float(f.get("cy", d.get("cy", seq.height / 2))),
-                    image=str(f["file_path"]),
-                    passes=f.get("exr_path"),
-                )
-            )
+        seq = sequence_from_json(json.loads(path.read_text(encoding="utf-8")), folder)
     check_sequence(seq, path)
+    return seq
+
+
+def sequence_from_json(d: dict, root: Path) -> Sequence:
+    """What `sequence_to_json` made, or others' that is like it; nothing is checked (see `check_sequence`). root: what
+    paths in it are below. Raises KeyError, TypeError, ValueError for what is missing or not of its type."""
+    norm = d.get("normalisation", {})
+    x, y, z = norm.get("translation", (0, 0, 0))
+    frames = [frame_number(f["frame"]) for f in d["frames"]]
+    seq = Sequence(
+        width=int(d["w"]),
+        height=int(d["h"]),
+        fps=float(d.get("fps", 24.0)),
+        frame_start=int(d.get("frame_start", math.floor(min(frames, default=0)))),
+        frame_end=int(d.get("frame_end", math.ceil(max(frames, default=0)))),
+        normalisation=Normalisation(float(norm.get("scale", 1.0)), (float(x), float(y), float(z))),
+        aabb=d.get("aabb", [[-1, -1, -1], [1, 1, 1]]),
+        provenance=d.get("provenance", {}),
+        tracks=d.get("tracks_path"),
+        untracked=[str(name) for name in d.get("untracked", [])],
+        root=root,
+    )
+    for frame, f in zip(frames, d["frames"], strict=True):
+        fx, fy = focal_lengths(d | f, seq.width)
+        seq.views.append(
+            View(
+                frame=frame,
+                camera=str(f.get("camera", "0")),
+                rig=str(f.get("rig", "")),
+                c2w=np.array(f["transform_matrix"], dtype=np.float64),
+                fx=fx,
+                fy=fy,
+                cx=float(f.get("cx", d.get("cx", seq.width / 2))),
+                cy=float(f.get("cy", d.get("cy", seq.height / 2))),
+                image=str(f["file_path"]),
+                passes=f.get("exr_path"),
+            )
+        )
     return seq
 
 

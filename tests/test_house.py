@@ -73,7 +73,7 @@ LAYERS = {
         ("datagen.curation.measures",),
         ("datagen.curation.duplicates", "datagen.curation.decisions"),
         ("datagen.curation.page",),
-        ("datagen.inspection", "datagen.importing", "datagen.curation"),
+        ("datagen.inspection", "datagen.importing", "datagen.curation", "datagen.shards"),
         ("datagen.writers",),
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.licences", "datagen.render_index"),
@@ -103,6 +103,7 @@ MODEL_READS = {
     "datagen.readers",
     "datagen.rigs",
     "datagen.sequence",
+    "datagen.shards",
     "datagen.track_file",
     "datagen.whole_folders",
 }

@@ -20,7 +20,7 @@ class TrainConfig:
     """All that a training run depends on; `add_arguments` says what each means. Raises InputError, which names the
     option, for a value that no run can use."""
 
-    data: tuple[Path, ...]  # Sequence folders, or folders that hold some at any depth
+    data: tuple[Path, ...]  # Sequence folders, or folders that hold some at any depth; or those of `timesplat pack`
     out: Path
 
     # the network; None: as the preset has it
@@ -58,6 +58,7 @@ class TrainConfig:
     checkpointing: bool = False
     device: str = "cpu"
     cache: Path = Path("data/cache")
+    workers: int = 0
     seed: int = 0
     reading: ReadOptions = DEFAULTS  # what is said of others' folders
 
@@ -73,6 +74,8 @@ class TrainConfig:
         for name in ("steps", "shrink", "accumulate"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name} {getattr(self, name)}: give a whole number above 0.")
+        if self.workers < 0:
+            raise InputError(f"--workers {self.workers}: give 0 or more processes.")
         parse_mix(self.mix)
         for field in fields(self):
             value, words = getattr(self, field.name), choices(field.name)
@@ -95,8 +98,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         name = name or option.removeprefix("--").replace("-", "_")
         p.add_argument(option, dest=name, choices=choices(name), help=text)
 
-    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences; rendered with passes for --source given "
-                   "and --geometric")  # fmt: skip
+    p.add_argument("data", nargs="+", type=Path, help="folders of Sequences, or of shards; rendered with passes for "
+                   "--source given and --geometric")  # fmt: skip
     p.add_argument("--out", type=Path, required=True, help="run folder; training goes on where it stands")
     choice("--preset", "network (default: %(default)s): base and large are the paper's, --head paper --source "
            "predicted; tiny and small are --head kinematic --source given; the six options below change what they "
@@ -131,6 +134,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--checkpointing", action="store_true", help="keep less memory, compute blocks twice")
     p.add_argument("--device", help="cpu or cuda (default: %(default)s)")
     p.add_argument("--cache", type=Path, help="where packed clips are kept (default: %(default)s)")
+    p.add_argument("--workers", type=int, help="processes that draw samples ahead; for shards 1 or 2 (default: "
+                   "%(default)s)")  # fmt: skip
     p.add_argument("--seed", type=int, help="of weights and samples (default: %(default)s)")
     p.set_defaults(**{f.name: f.default for f in fields(TrainConfig) if f.default is not MISSING})
     add_reading(p)

@@ -77,13 +77,19 @@ class ClipDataset:
 
     def __str__(self) -> str:
         parts = [f"{len(self.groups[g])} {g} ({p:.1%})" for g, p in zip(GROUPS, self.probabilities, strict=True)]
-        return f"{len(self.paths)} clips: {', '.join(parts)}"
+        return f"{sum(map(len, self.groups.values()))} clips: {', '.join(parts)}"
 
     def sample(self, rng: np.random.Generator, targets: int, inputs: int = 24) -> Sample:
         """A clip at random, and of it at most `inputs` and `targets` views as `sampling` chooses them. Static samples
         are at time 0, and nothing moves in them. Raises InputError where the clip lacks the views for it."""
         group = self.groups[GROUPS[rng.choice(len(GROUPS), p=self.probabilities)]]
-        path = group[rng.integers(len(group))]
+        sample = self._read(group[rng.integers(len(group))], rng, targets, inputs)
+        for views in (sample.inputs, sample.targets):
+            if self.sampling == "static":
+                views.time, views.flow = 0 * views.time, None if views.flow is None else 0 * views.flow
+        return sample
+
+    def _read(self, path: Path, rng: np.random.Generator, targets: int, inputs: int) -> Sample:
         with safe_open(path, "pt") as f:
             meta = f.metadata()
             frame, camera = f.get_tensor("frame").numpy(), f.get_tensor("camera").numpy()
@@ -92,9 +98,6 @@ class ClipDataset:
             input_rows, target_rows = sample_views(self.sampling, rng, clip, inputs, targets)
             seen = shrink(read_views(f, input_rows, step, self.has_depth), self.shrink)
             wanted = shrink(read_views(f, target_rows, step, has_depth=False), self.shrink)
-        if self.sampling == "static":
-            seen.time, wanted.time = 0 * seen.time, 0 * wanted.time
-            seen.flow = None if seen.flow is None else 0 * seen.flow
         return Sample(seen, wanted, meta["asset"])
 
 

@@ -28,8 +28,10 @@ from .dataset import ClipDataset, Sample
 from .deferred import DetachedScene
 from .losses import PixelTruth, geometric_loss, load_perceptual_loss, photometric_loss, pixel_truth
 from .optimizers import clip_and_step, learning_rate, weights_fit_checkpoint
+from .prefetch import samples
 from .reporting import StageTimer, StepResult, report_line
 from .run_state import RunState
+from .shard_dataset import ShardDataset, holds_shards
 from .view_sampling import DEFAULT_COUNTS
 
 
@@ -65,10 +67,15 @@ def train(config: TrainConfig) -> None:
 
 
 def load_clips(config: TrainConfig) -> ClipDataset:
-    """The clips; one process packs, the others then find them packed. Raises InputError."""
+    """The clips; of Sequences one process packs, the others then find them packed. Raises InputError."""
+    has_depth = network_config(config).source == "given" or config.geometric > 0
+    sharded = [holds_shards(folder) for folder in config.data]
+    if any(sharded):
+        if not all(sharded):
+            raise InputError(f"{config.data[sharded.index(False)]}: no shards, which the others are; pack it too.")
+        return ShardDataset(config.data, config.shrink, config.sampling, config.mix, has_depth)
     if distributed.rank():
         distributed.barrier()
-    has_depth = network_config(config).source == "given" or config.geometric > 0
     how = (config.shrink, config.sampling, config.mix, has_depth, config.reading)
     clips = ClipDataset(config.data, config.cache, *how)
     if not distributed.rank():
@@ -113,6 +120,16 @@ class Trainer:
         config.out.mkdir(parents=True, exist_ok=True)
         if self.state_path.exists():
             self.state.load(self.state_path, config.device)
+        self.samples = samples(
+            clips,
+            seed=config.seed,
+            step=self.state.step,
+            rank=distributed.rank(),
+            accumulate=config.accumulate,
+            inputs=self.inputs,
+            targets=self.targets,
+            workers=config.workers,
+        )
 
     def progress(self) -> float:
         """0..1, by the clock where minutes are given, else by steps."""
@@ -127,6 +144,7 @@ class Trainer:
         try:
             self._loop()
         finally:
+            self.samples.close()
             signal.signal(signal.SIGINT, previous)
         if self.interrupted or self.stopped:
             raise KeyboardInterrupt
@@ -190,16 +208,14 @@ class Trainer:
         )
 
     def train_step(self) -> StepResult:
-        """One step of the optimizers over `accumulate` samples. Samples are seeded by the step and their number in it,
-        over all processes: a resumed run draws what an unbroken one would have, and two processes what one with twice
-        the samples would. Raises InputError where a weight has outgrown what a checkpoint holds."""
+        """One step of the optimizers over `accumulate` samples, see `samples`. Raises InputError where a weight has
+        outgrown what a checkpoint holds."""
         config, state = self.config, self.state
         self.network.train()
         found = []
-        for n in range(config.accumulate):
-            rng = np.random.default_rng((config.seed, state.step, distributed.rank() * config.accumulate + n))
+        for _ in range(config.accumulate):
             with self.timer.stage("data"):
-                sample = self.clips.sample(rng, targets=self.targets, inputs=self.inputs)
+                sample, rng = next(self.samples)
             found.append(self.backward_sample(sample, rng))
         distributed.average_gradients(self.network)
         rate = learning_rate(config.rate, state.step, config.warmup, self.progress())
