@@ -153,7 +153,7 @@ def _page(stem: Path, rows: list[dict], size: int, made_by: Provenance) -> str:
         "import, measuring the bounds), then an image, and of it: what comes before the first sample, samples, "
         "denoising, reading the EXR that Blender wrote, PNG, and the EXR of depth and motion, which the recipes lack.",
         "Objaverse-XL and TRELLIS: 128 samples, few bounces, denoised, with their filters (0.01 pixels wide; a box of "
-        "one), under our light, for all must show the same. What holds their PSNR down is edges, the light that is left "
+        "one), under our light, for all must show the same. What holds their PSNR down is edges, light that is left "
         "out and the denoiser, not noise. 128 and 16 samples alone: with our filter, all bounces, and not denoised, so "
         "that only how it is run differs: one render an image, and nothing kept.",
     ]
