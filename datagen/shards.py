@@ -285,7 +285,7 @@ class PackedSequence(Sequence):
         """As of any Sequence."""
         if self.spans[index][1] is None:
             raise InputError(f"{self.shard}: {self.key} was packed without passes; pack it with them.")
-        with tempfile.TemporaryDirectory() as folder:  # OpenEXR reads files alone
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # OpenEXR reads files alone
             path = Path(folder) / "x.exr"
             path.write_bytes(self._file(index, 1))
             try:
