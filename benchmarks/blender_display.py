@@ -83,7 +83,7 @@ def frame_changes(ob, what: str) -> list[tuple[str, float]]:
     from timesplat.addon.asset.sliders import asset_modifier, set_input
 
     scene, rows = bpy.context.scene, []
-    for look in ("Points", "Splats"):
+    for look in ("Points", "Ellipsoids", "Splats"):
         set_input(asset_modifier(ob), "Look", look)
         for name, step in (("whole frames", 1.0), ("fractional frames", 0.37)):
 

@@ -7,12 +7,13 @@ The point cloud holds the Gaussians at their own times, with the attributes
     gs_color                                       LINEAR colour: the asset's sRGB is converted here, once,
                                                    because Blender blends in linear light
     gs_order                                       a random order in 0..1, for the slider Density
-    gs_radius, gs_reach, gs_row_0..2               radius of each look; rows of (R S)⁻¹ for the shader
+    gs_radius, gs_reach, gs_row_0..2               radius of Points and Splats; rows of (R S)⁻¹ for the shader
+    those of ellipsoids.py                         for the look Ellipsoids
     those of tracks.py                             where Gaussians ride on paths
-and the modifier evaluates positions, `gs_alpha` (opacity at the moment) and radius. Looks: Points are opaque
-dots, fast; Splats are spheres of three σ whose shader computes gs_alpha · exp(-½ d²) with d the distance, in σ,
-at which the view ray passes the centre. Custom properties of the object: `timesplat` (1: it is an asset),
-`timesplat_clip` (the Clip), and what others note there (`timesplat_source`: names of the original objects).
+and the modifier evaluates positions, `gs_alpha` (opacity at the moment) and radius. Looks: Ellipsoids are opaque
+solids; Points are opaque dots, fastest; Splats are spheres of three σ whose shader computes gs_alpha · exp(-½ d²) with
+d the distance, in σ, at which the view ray passes the centre. Custom properties of the object: `timesplat` (1: it is
+an asset), `timesplat_clip` (the Clip), and what others note there (`timesplat_source`: names of the original objects).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import numpy as np
 from ...model.io.asset import VISIBLE, Asset, Clip, linear_from_srgb, rotation_matrices
 from . import nodes
 from .attributes import write_attributes
+from .ellipsoids import ellipsoid_attributes
 from .sliders import NATIVE, set_input
 from .tracks import knots_object, track_attributes
 
@@ -126,6 +128,7 @@ def attributes(asset: Asset) -> list[tuple]:
         ("gs_radius", "FLOAT", np.sort(soft, 1)[:, 1]),  # covers a flat splat's face
         ("gs_reach", "FLOAT", SPLAT_RADIUS * scale.max(1)),
         *((f"gs_row_{i}", "FLOAT_VECTOR", rows[:, i]) for i in range(3)),
+        *ellipsoid_attributes(soft, rotation),
     ]
     if asset.paths is not None:
         found += track_attributes(asset, offset)

@@ -29,10 +29,11 @@ import numpy as np
 
 from ...model.io.asset import SH_C0
 from ...model.io.paths import WINDOW_SLACK
+from .ellipsoids import ellipsoids
 from .node_trees import Nodes
 from .sliders import NATIVE, REPEATS, SLIDERS
 
-GROUP = "Timesplat 2"  # the number counts versions of the node group, so that old files keep theirs
+GROUP = "Timesplat 3"  # the number counts versions of the node group, so that old files keep theirs
 NATIVE_NAMES = ("3D Gaussian Splats", "GAUSSIAN_SPLAT")  # of the type: what the menu shows, its identifier
 
 
@@ -169,6 +170,7 @@ def _turn(n: Nodes, g, name: str, kind: str):
 
 def _choose_look(n: Nodes, given, g, tracked: bool):
     """The Gaussians as the slider Look has them. What only some looks need is not evaluated for the others."""
+    solids = ellipsoids(n, g, given["Point Size"], points_material(), tracked)
     size = n.math("MULTIPLY", n.named("gs_radius"), given["Point Size"])
     points = n.out("GeometryNodeSetPointRadius", g, None, size)
     points = n.out("GeometryNodeSetMaterial", points, None, points_material())
@@ -178,8 +180,8 @@ def _choose_look(n: Nodes, given, g, tracked: bool):
     splats = n.out("GeometryNodeSetPointRadius", splats, None, n.named("gs_reach"))
     splats = n.out("GeometryNodeSetMaterial", splats, None, splats_material())
     viewport = n.add("GeometryNodeIsViewport").outputs[0]
-    automatic = n.out("GeometryNodeSwitch", viewport, splats, points, input_type="GEOMETRY")
-    options = {"Automatic": automatic, "Points": points, "Splats": splats}
+    automatic = n.out("GeometryNodeSwitch", viewport, splats, solids, input_type="GEOMETRY")
+    options = {"Automatic": automatic, "Points": points, "Splats": splats, "Ellipsoids": solids}
     if NATIVE:
         options["Native"] = native_splats(n, _turn(n, g, "rotation", "QUATERNION") if tracked else g)
     return n.menu(given["Look"], options, "GEOMETRY")

@@ -14,7 +14,7 @@ from ...model.io.asset import VISIBLE
 # radiance:base (the constant spherical harmonic of sRGB colour, opacity), as its importers of .ply and USD write
 # them (Blender's source: io/ply/importer/ply_import_gsplat.cc, nodes/geometry/nodes/node_geo_points_type.cc).
 NATIVE = bpy.app.version >= (5, 3) and hasattr(bpy.types, "GeometryNodePointsSetType")
-LOOKS = ("Automatic", "Points", "Splats", *(["Native"] if NATIVE else []))
+LOOKS = ("Automatic", "Points", "Splats", "Ellipsoids", *(["Native"] if NATIVE else []))
 REPEATS = ("Hold", "Loop", "Ping-Pong")
 MENUS = {"Look": LOOKS, "Repeat": REPEATS}
 
@@ -29,9 +29,9 @@ class Slider(NamedTuple):
 
 
 SLIDERS = {
-    "Look": Slider("", "Menu", "Automatic", None, None, "Automatic is Points in the viewport and Splats in renders"),
+    "Look": Slider("", "Menu", "Automatic", None, None, "Automatic: Ellipsoids in the viewport, Splats in renders"),
     "Opacity Cut": Slider("", "Float", VISIBLE, 0, 1, "Gaussians fainter than this at a moment are left out"),
-    "Point Size": Slider("", "Float", 1.5, 0, 100, "Radius of the dots of the look Points, in standard deviations"),
+    "Point Size": Slider("", "Float", 1.5, 0, 100, "Radius of ellipsoids and points, in standard deviations"),
     "Density": Slider("", "Float", 1.0, 0, 1, "Share of the Gaussians that is shown"),
     "Frame Start": Slider("Time", "Float", 0.0, -1e6, 1e6, "Scene frame at which the clip starts"),
     "Frame End": Slider("Time", "Float", 23.0, -1e6, 1e6, "Scene frame at which the clip ends"),

@@ -12,6 +12,7 @@ from ...datagen import rigs
 from ...datagen.scene.measure import normalisation
 from ...datagen.sequence import InputError
 from .. import settings
+from ..asset.visibility import captured
 
 RIGS = [
     ("CANONICAL", "Canonical", "Four cameras that stand still: front, left, back, right"),
@@ -74,7 +75,9 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
         try:
             frames = settings.frames(chosen, scene)
             some = sorted({frames[round(i * (len(frames) - 1) / 11)] for i in range(12)})
-            norm, _ = normalisation(some, settings.objects(chosen, context), name=scene.name, rendered=False)
+            objects = settings.objects(chosen, context)
+            with captured(objects):
+                norm, _ = normalisation(some, objects, name=scene.name, rendered=False)
         except InputError as e:
             self.report({"ERROR"}, str(e))
             return {"CANCELLED"}

@@ -15,6 +15,7 @@ from bpy.props import EnumProperty, IntProperty
 
 from ...datagen.scene.borrow import shown_objects
 from ...datagen.sequence import InputError
+from ..asset.visibility import show
 from ..runtime import background_blender, child_process, jobs
 from ..runtime.render_comparison import GAIN
 from .common import OnAsset, errors_reported
@@ -129,12 +130,7 @@ class TIMESPLAT_OT_show(OnAsset, bpy.types.Operator):
             originals = originals_of(context.object, context)
         if not originals:
             return {"CANCELLED"}
-        hidden = dict.fromkeys(originals, self.what == "RESULT") | {context.object: self.what == "ORIGINAL"}
-        for ob, hide in hidden.items():
-            if ob.name in context.view_layer.objects:
-                ob.hide_set(hide)
-            if ob.is_editable:  # what is linked from another file is not
-                ob.hide_render = hide
+        show(context.object, originals, self.what, context)
         return {"FINISHED"}
 
 

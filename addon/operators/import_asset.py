@@ -29,8 +29,9 @@ from ..runtime import child_process, worker_options
 from .common import wait_cursor
 
 LOOK_ITEMS = [
-    ("Automatic", "Automatic", "Points in the viewport, Splats in renders"),
-    ("Points", "Points", "Opaque dots: fast"),
+    ("Automatic", "Automatic", "Ellipsoids in the viewport, Splats in renders"),
+    ("Ellipsoids", "Ellipsoids", "Opaque solids, each of its Gaussian's shape"),
+    ("Points", "Points", "Opaque dots: fastest"),
     ("Splats", "Splats", "Soft ellipsoids, as the asset was fitted: slower"),
 ]
 UP_ITEMS = [

@@ -21,6 +21,7 @@ from ...model.io.ply import read_ply, write_ply
 from .. import estimates, settings
 from ..asset.display import add_asset
 from ..asset.parenting import follow
+from ..asset.visibility import show
 from ..runtime import child_process, jobs, worker_options
 from ..runtime.capture import start_capture
 from .common import errors_reported
@@ -120,6 +121,7 @@ def start(chosen, context) -> jobs.Job:
             estimates.learn_number(method, len(asset), expected.pictures, size)
         ob = add_asset(asset, "Timesplat", look=look, context=bpy.context)
         originals.note_in(ob)
+        show(ob, originals.found(), "RESULT", bpy.context)
         ob["timesplat_lighting"] = shot["lighting"]
         said = f"{len(asset):,} Gaussians in {time.monotonic() - begun:.0f} s"
         note = f" {event['note']}." if event.get("note") else ""
@@ -151,9 +153,13 @@ class _Originals:
         root, pose = (roots[0].session_uid, _pose(roots[0])) if len(roots) == 1 else (0, Matrix.Scale(0, 4))
         return cls(frozenset(o.session_uid for o in captured), root, pose)
 
+    def found(self) -> list:
+        """Those that are still in the scene."""
+        return [o for o in bpy.context.scene.objects if o.session_uid in self.uids]
+
     def note_in(self, ob) -> None:
         """Notes their names in the asset object, and lets it follow the root."""
-        found = {o.session_uid: o for o in bpy.context.scene.objects if o.session_uid in self.uids}
+        found = {o.session_uid: o for o in self.found()}
         ob["timesplat_source"] = [o.name for o in found.values()]
         if self.pose.determinant() and self.root in found and follow(ob, found[self.root]):
             ob.matrix_parent_inverse = self.pose.inverted()  # it may have been moved since

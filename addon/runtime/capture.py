@@ -22,6 +22,7 @@ from ...datagen.scene.measure import normalisation
 from ...datagen.scene.open import tool_versions
 from ...datagen.scene.simulate import simulate
 from ...datagen.sequence import InputError, Normalisation
+from ..asset.visibility import HIDDEN
 from . import background_blender, child_process
 
 
@@ -65,6 +66,9 @@ def _capture(request: dict, progress) -> dict:
     scene, frames = bpy.context.scene, request["frames"]
     by_name = {ob.name_full: ob for ob in scene.objects}  # names alone are not unique: two libraries may use one
     objects, cameras = ([by_name[n] for n in request[key]] for key in ("objects", "cameras"))
+    for ob in objects:
+        if ob.get(HIDDEN):
+            ob.hide_render = False
     progress(0.02, "measuring the object")
     simulate(frames[-1])
     norm, aabb = normalisation(frames, objects, name=scene.name)

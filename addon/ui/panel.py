@@ -29,7 +29,7 @@ class _Sidebar:
 
 class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
     bl_label = "Timesplat"
-    bl_order = 0
+    bl_order = 1
 
     def draw_header_preset(self, context):
         TIMESPLAT_PT_presets.draw_panel_header(self.layout)

@@ -27,7 +27,7 @@ for look in ("Points", "Splats"):
         scene.frame_set(int(frame), subframe=frame % 1)
         out[f"{look} {frame}"] = shown(ob, "position", "gs_alpha", "radius", "gs_color")
 tell(frames=out, type=ob.type, clouds=part("addon.asset.display").has_point_clouds(), selected=ob.select_get(),
-     names=[a.name for a in ob.data.attributes], meshes=len(bpy.data.meshes),
+     names=[a.name for a in ob.data.attributes], meshes=sum(m.name != "Timesplat Ellipsoid" for m in bpy.data.meshes),
      bounces=scene.cycles.transparent_max_bounces, torch="torch" in sys.modules)
 """
 

@@ -158,7 +158,7 @@ def test_an_object_gives_the_asset_back_and_what_is_left_of_it(start, tmp_path):
     assert np.array_equal(left.paths.place, want.paths.place) and np.array_equal(left.xyz, want.xyz)
     assert_shown(told["left"], want, want.frame_to_time(21.5))
     assert "import it again" in told["none"] and "import it again" in told["empty"] and "10" not in told["many"]
-    assert "too many" in told["many"] and told["objects"] == ["a", "a Paths"]
+    assert "too many" in told["many"] and told["objects"] == ["a", "a Paths", "Timesplat Ellipsoid"]
 
 
 CASES = [
@@ -250,7 +250,7 @@ def test_it_plays_on_in_other_files_and_scenes(blender, start, tmp_path):
     """And without the add-on, of which the second Blender knows nothing."""
     asset = make_tracked()
     told = start(PASSED_ON, asset)
-    assert told["in scenes"] == ["a"] and told["names"] == ["a", "a Paths", "a.001"]
+    assert told["in scenes"] == ["a"] and told["names"] == ["Timesplat Ellipsoid", "a", "a Paths", "a.001"]
     taken = blender(READ + TAKEN, tmp_path)
     assert taken["ours"] == [] and taken["append shows"] == taken["link shows"] == ["a"]
     position, opacity = asset.at(asset.frame_to_time(21.5))

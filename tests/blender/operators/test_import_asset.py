@@ -21,7 +21,7 @@ atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwis
 display = part("addon.asset.display")
 def load(**options):
     try:
-        done = bpy.ops.timesplat.import_asset(**options)
+        done = bpy.ops.timesplat.import_asset(**{"look": "Points"} | options)
     except RuntimeError as e:
         return {"error": str(e).strip().removeprefix("Error: ")}
     ob, scene = bpy.context.object, bpy.context.scene
