@@ -39,15 +39,15 @@ def main(argv: list[str]) -> int:
         ("reconstruct", "the object as 4D Gaussians, into the scene, a .ply or a new .blend"),
     ):
         sub = commands.add_parser(name, help=text, description=text)
-        keys = ("source", "collection", "in_turn", "frame_range", "frame_start", "frame_end", "every", "size",
-                "samples", "lighting") if name == "render" else settings.KEYS  # fmt: skip
+        keys = ("source", "collection", "leave_out", "in_turn", "frame_range", "frame_start", "frame_end", "every",
+                "size", "samples", "lighting") if name == "render" else settings.KEYS  # fmt: skip
         for key in keys:
             if key not in SKIPPED:
                 _option(sub, chosen, key)
         if name == "render":
             sub.add_argument("--out", type=Path, required=True, help="folder of the Sequence to write")
             sub.add_argument("--rig", choices=rigs.RIGS, help="cameras of a rig (default: those of the scene that are "
-                             "selected or in the Timesplat rig, else alternating)")  # fmt: skip
+                             "selected or in the Timesplat rig, else coverage)")  # fmt: skip
             sub.add_argument("--targets", type=int, default=0, help="held-out random views a frame")
             sub.add_argument("--no-passes", dest="passes", action="store_false", help="pictures alone")
             sub.add_argument("--seed", type=int, default=0)
@@ -86,7 +86,7 @@ def _option(parser, chosen, key: str) -> None:
 
 
 def _render(chosen, args) -> None:
-    rig = {"rig": args.rig, "targets": args.targets, "seed": args.seed, "passes": args.passes, "tracks": True}
+    rig = {"rig": args.rig, "targets": args.targets, "seed": args.seed, "passes": args.passes, "tracks": 0}
     request = reconstruct.request(chosen, bpy.context) | rig | {"sequence": str(args.out.resolve())}
     stages = [lambda folder: start_capture(request, folder)]
     job = jobs.start("Rendering", stages, lambda event, folder: f"{event['pictures']} pictures")

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .settings import cameras, frames
+from .settings import picture_count
+from .settings import quality as quality_of
 
 # Gaussians a pixel that counts (`_pixels_that_count`): the mean of 12 objects (tracks: 7, deform: 4), until one is made
 _gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "deform": 0.4}
@@ -41,9 +42,8 @@ class Estimate:
 
 def estimate(settings, context) -> Estimate:
     """Nothing is evaluated or read for it. Raises InputError for an empty range of frames."""
-    n = len(frames(settings, context.scene))
-    placed, _ = cameras(context)
-    n *= 1 if settings.in_turn or not placed else len(placed)
+    n = picture_count(settings, context)
+    quality = quality_of(settings)
     pixels = n * settings.size**2
     predicted = _gaussians_a_pixel[settings.method] * _pixels_that_count(settings.method, n, settings.size)
     fit, most = settings.refine, predicted
@@ -54,13 +54,13 @@ def estimate(settings, context) -> Estimate:
     else:
         if settings.budget != "ALL":
             fit = fit or FIT_SECONDS * max(settings.size**2 / USUAL_PIXELS, 1)
-        if fit or settings.quality != "SECONDS":
+        if fit or quality != "SECONDS":
             most = USUAL_GAUSSIANS * settings.size / USUAL_PIXELS**0.5
-    if settings.quality != "SECONDS":
-        most = min(most, QUALITIES[settings.quality][2])
+    if quality != "SECONDS":
+        most = min(most, QUALITIES[quality][2])
     kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
     count = min(kept, most, predicted)
-    if settings.quality != "SECONDS":
+    if quality != "SECONDS":
         fit = _fit_seconds(settings, n, count)
     fits = 3 if settings.budget == "AUTO" else 1
     rendering = START_SECONDS + pixels * settings.samples * _seconds_a_sample

@@ -6,8 +6,10 @@ from __future__ import annotations
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
+from ..datagen.rigs import COVERAGE_VIEWS
 from ..datagen.scene.borrow import shown_objects
 from ..datagen.sequence import InputError
+from . import survey
 from .asset.sliders import LOOKS
 
 RIG_COLLECTION = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
@@ -46,7 +48,7 @@ class Settings:
     """Mixed into the operator and into the scene's property group."""
 
     source: EnumProperty(
-        name="Object",
+        name="Source",
         description="What is captured; Gaussian assets are always left out",
         items=[
             ("SCENE", "All", "Everything that renders show"),
@@ -55,26 +57,35 @@ class Settings:
         ],
     )
     collection: StringProperty(name="Collection", description="The collection to capture")
+    leave_out: BoolProperty(
+        name="Leave Out Surroundings",
+        description="With Source at All: a ground, a backdrop or a dome that dwarfs all else is not captured. It would "
+        "set the bounds, and what matters would be a few pixels",
+        default=True,
+    )
     in_turn: BoolProperty(
-        name="One Camera a Frame",
+        name="Alternate Cameras",
         description="Cameras take turns, a picture a frame: fewer pictures, less time",
     )
     frame_range: EnumProperty(
         name="Frames",
-        items=[("SCENE", "Scene", "The scene's frame range"), ("CUSTOM", "Range", "A range of its own")],
+        items=[
+            ("SCENE", "Scene", "The scene's frame range, or what of it is animated where the last key comes earlier"),
+            ("CUSTOM", "Range", "A range of its own"),
+        ],
     )
     frame_start: IntProperty(name="Start", default=1)
     frame_end: IntProperty(name="End", default=24)
     every: IntProperty(
-        name="Every n-th",
+        name="Frame Step",
         description=f"Capture every n-th frame; 0: so many that there are at most {MOST_AUTOMATIC_FRAMES}",
         min=0,
         max=1000,
     )
-    size: IntProperty(name="Resolution", description="Pixels a side", default=128, min=16, max=2048, step=8)
+    size: IntProperty(name="Resolution", description="Pixels a side", default=256, min=16, max=2048, step=8)
     samples: IntProperty(name="Samples", description="Cycles samples a pixel", default=16, min=1, max=4096)
     lighting: BoolProperty(
-        name="Even Light",
+        name="Studio Lighting",
         description="Three suns and a grey world, which the network was trained with, in place of the scene's lights",
         default=True,
     )
@@ -83,11 +94,12 @@ class Settings:
         name="Quality",
         description="How much is fitted to the pictures. All but Seconds come out the same however busy the machine is",
         items=QUALITIES,
-        default="SECONDS",
+        default="BALANCED",
     )
     refine: FloatProperty(
-        name="Refine",
-        description="With Quality at Seconds: those for which the Gaussians are fitted to the pictures, at most. 0: "
+        name="Fit",
+        description="With Quality at Seconds (which it is where a script names these alone): those for which the "
+        "Gaussians are fitted to the pictures, at most. 0: "
         "none for Tracks and where all are kept; for fewer as long as it takes, 5 s for pictures of 128 pixels and "
         "more for larger ones",
         default=10.0,
@@ -108,7 +120,16 @@ KEYS = tuple(Settings.__annotations__)
 
 
 class TIMESPLAT_PG_settings(Settings, bpy.types.PropertyGroup):
-    pass
+    frame_step: EnumProperty(
+        name="Frame Step",
+        description="Which frames of the range are captured",
+        items=[
+            ("AUTO", "Auto", f"As many as there may be with an even step: at most {MOST_AUTOMATIC_FRAMES}"),
+            ("EVERY", "Every", "Every n-th"),
+        ],
+        get=lambda self: int(self.every > 0),
+        set=lambda self, value: setattr(self, "every", value and max(self.every, 1)),
+    )
 
 
 # ---------------------------------------------------------------- what they select
@@ -125,6 +146,8 @@ def frames(settings, scene) -> range:
     """The scene frames to capture. Raises InputError for an empty range."""
     own = settings.frame_range == "CUSTOM"
     first, last = (settings.frame_start, settings.frame_end) if own else (scene.frame_start, scene.frame_end)
+    if not own and (end := survey.animation_end(scene.objects)) is not None and first < end < last:
+        last = end
     if last < first:
         raise InputError(f"Frames {first} to {last}: the range is empty; let it end after its start.")
     return range(first, last + 1, settings.every) if settings.every else spread(first, last, MOST_AUTOMATIC_FRAMES)
@@ -135,6 +158,8 @@ def objects(settings, context) -> list:
     that could be seen."""
     scene = context.scene
     shown = [o for o in shown_objects(scene, context.view_layer) if not o.get("timesplat")]
+    around = left_out(settings, context)
+    shown = [o for o in shown if o not in around]
     if settings.source == "SELECTED":
         family = {o for s in context.view_layer.objects.selected for o in (s, *s.children_recursive)}
         shown = [o for o in shown if o in family or o.type == "LIGHT"]
@@ -145,13 +170,31 @@ def objects(settings, context) -> list:
         inside = set(collection.all_objects)
         shown = [o for o in shown if o in inside or o.type == "LIGHT"]
     if not any(o.type in CAPTURED_TYPES or o.instance_type == "COLLECTION" for o in shown):
-        raise InputError("There is nothing to capture: no mesh is chosen that renders show; choose another Object.")
+        raise InputError("There is nothing to capture: no mesh is chosen that renders show; choose another Source.")
     return shown
+
+
+def left_out(settings, context) -> list:
+    """The surroundings that are not captured."""
+    if settings.source != "SCENE" or not settings.leave_out:
+        return []
+    return survey.surroundings(captured_shapes(context))
+
+
+def captured_shapes(context) -> list:
+    """The objects that renders show, without lights, cameras and asset objects."""
+    found = shown_objects(context.scene, context.view_layer)
+    return [o for o in found if not o.get("timesplat") and o.type not in ("LIGHT", "CAMERA")]
+
+
+def method(settings, objects: list) -> str:
+    """The method that is used: Pictures Only in place of those that follow surfaces, where there hardly is one."""
+    return "deform" if survey.mostly_without_surface(objects) else settings.method
 
 
 def cameras(context) -> tuple[list, str]:
     """-> (camera objects to take pictures with, what to call them): the selected ones, else those of the rig,
-    else none: canonical views in turn."""
+    else none: the rig `coverage`."""
     selected = [o for o in context.view_layer.objects.selected if o.type == "CAMERA"]
     if selected:
         return selected, f"{len(selected)} selected camera{'s' * (len(selected) > 1)}"
@@ -159,7 +202,15 @@ def cameras(context) -> tuple[list, str]:
     placed = [o for o in rig.objects if o.type == "CAMERA" and o.name in context.scene.objects] if rig else []
     if placed:
         return placed, f"{len(placed)} camera{'s' * (len(placed) > 1)} of the rig"
-    return [], "Front, left, back, right in turn"
+    return [], "All sides, above and below in turn"
+
+
+def picture_count(settings, context) -> int:
+    """How many pictures are taken. Raises InputError for an empty range of frames."""
+    count, placed = len(frames(settings, context.scene)), len(cameras(context)[0])
+    if not placed:
+        return count * -(-COVERAGE_VIEWS // count)
+    return count if settings.in_turn else count * placed
 
 
 def budget(settings) -> str | None:
@@ -169,11 +220,17 @@ def budget(settings) -> str | None:
     ]
 
 
+def quality(settings) -> str:
+    """Of QUALITIES. Where a script names seconds to fit and no quality, it means these."""
+    only_seconds = settings.is_property_set("refine") and not settings.is_property_set("quality")
+    return "SECONDS" if only_seconds else settings.quality
+
+
 def fit(settings) -> dict:
     """How long is fitted, as the worker has it: a quality, or seconds."""
-    if settings.quality == "SECONDS":
+    if (chosen := quality(settings)) == "SECONDS":
         return {"quality": None, "refine": settings.refine}
-    return {"quality": settings.quality.lower(), "refine": 0.0}
+    return {"quality": chosen.lower(), "refine": 0.0}
 
 
 def register() -> None:

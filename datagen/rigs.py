@@ -19,6 +19,7 @@ DISTANCE = 2.7  # of most cameras from the origin, in normalised units
 FOV = 50.0  # degrees, full field of view
 RADIUS = 1.1  # of the ball around the origin that holds every object, see `scene.measure.normalisation`
 NEAREST = RADIUS / math.sin(math.radians(FOV) / 2)  # a camera that is nearer does not see this ball whole
+COVERAGE_VIEWS = 24  # at least, of the rig `coverage`
 CANONICAL = {"front": 0.0, "left": 90.0, "back": 180.0, "right": 270.0}  # camera id -> azimuth in degrees
 
 
@@ -138,6 +139,20 @@ def mixed(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     return sorted(canonical(frames) + random_poses(frames, seed, per_frame=2), key=lambda s: s.frame)
 
 
+def coverage(frames: Sequence[int], seed: int = 0) -> list[Shot]:
+    """One view a frame, or more where there are fewer frames than COVERAGE_VIEWS: by fours around the object, in turn
+    at its height, 40 degrees above and 30 below, each four turned against those before, so that tops and undersides
+    are seen too."""
+    each, shots = -(-COVERAGE_VIEWS // max(len(frames), 1)), []
+    for i, f in enumerate(frames):
+        for k in range(i * each, (i + 1) * each):
+            row, side = divmod(k % COVERAGE_VIEWS, 4)
+            azimuth = 90 * side + 22.5 * ((2 * row + row // 4) % 4)
+            pose = spherical(azimuth, (0, 40, -30)[row % 3])
+            shots.append(Shot(f, f"coverage{k % COVERAGE_VIEWS}", "coverage", pose))
+    return shots
+
+
 def turntable(frames: Sequence[int], seed: int = 0) -> list[Shot]:
     """For showing: one camera that goes once around the object over the clip, 20 degrees above it."""
     return [Shot(f, "turntable", "turntable", spherical(360 * i / len(frames), 20)) for i, f in enumerate(frames)]
@@ -214,6 +229,7 @@ RIGS: dict[str, Callable[[Sequence[int], int], list[Shot]]] = {
     "elevated": elevated,
     "orbit": orbit,
     "mixed": mixed,
+    "coverage": coverage,
     "turntable": turntable,
     "demo": demo_rig,
     "evaluation": evaluation,

@@ -57,8 +57,10 @@ LAYERS = {
     "addon": (
         ("addon.asset",),
         ("addon.runtime",),
+        ("addon.survey",),
         ("addon.settings",),
         ("addon.estimates",),
+        ("addon.notices",),
         ("addon.operators",),
         ("addon.ui",),
         ("addon.command_line", "addon.package"),

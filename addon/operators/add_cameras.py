@@ -5,6 +5,7 @@ the panel. They lie in one collection, which Reconstruct takes where no camera i
 import math
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 from mathutils import Matrix
 
@@ -15,11 +16,16 @@ from .. import settings
 from ..asset.visibility import captured
 
 RIGS = [
-    ("CANONICAL", "Canonical", "Four cameras that stand still: front, left, back, right"),
-    ("ROTATING", "Two Rotating", "Two cameras that go from the front to the back, one on each side"),
+    ("CANONICAL", "Four Sides", "Four cameras that stand still: front, left, back, right"),
     ("ORBIT", "Orbit", "Cameras that stand still, evenly around the object"),
+    ("DOME", "Dome", "Cameras that stand still, evenly all around, above and below"),
     ("TURNTABLE", "Turntable", "One camera that goes once around the object"),
+    ("RANDOM", "Random", "Cameras that stand still anywhere around, from below to above"),
+    ("ROTATING", "Two Rotating", "Two cameras that go from the front to the back, one on each side"),
 ]
+ADVANCED = ("ROTATING",)
+LOWEST, HIGHEST = -30, 75  # elevations of a dome, in degrees
+GOLDEN = 137.508  # degrees
 
 
 def shots(rig: str, count: int, elevation: float, distance: float, frames: list[int]) -> list[rigs.Shot]:
@@ -34,6 +40,11 @@ def shots(rig: str, count: int, elevation: float, distance: float, frames: list[
         around = [(name, [step * i for i in numbers]) for name, step in ways.items()]
     elif rig == "ORBIT":
         around = [(f"orbit{k}", [360 * k / count] * len(frames)) for k in range(count)]
+    elif rig in ("DOME", "RANDOM"):
+        places = _dome(count) if rig == "DOME" else _random(count)
+        poses = [rigs.spherical(azimuth, height, distance) for azimuth, height in places]
+        name = rig.lower()
+        return [rigs.Shot(i, f"{name}{k}", name, pose) for i in numbers for k, pose in enumerate(poses)]
     else:
         around = [("turntable", [360 * i / len(frames) for i in numbers])]
     return [
@@ -41,6 +52,18 @@ def shots(rig: str, count: int, elevation: float, distance: float, frames: list[
         for i in numbers
         for name, azimuths in around
     ]
+
+
+def _dome(count: int) -> list[tuple[float, float]]:
+    """Azimuth and elevation in degrees, evenly over what lies between LOWEST and HIGHEST."""
+    low, high = (math.sin(math.radians(x)) for x in (LOWEST, HIGHEST))
+    heights = [low + (high - low) * (k + 0.5) / count for k in range(count)]
+    return [(GOLDEN * k % 360, math.degrees(math.asin(h))) for k, h in enumerate(heights)]
+
+
+def _random(count: int) -> list[tuple[float, float]]:
+    rng = np.random.default_rng(0)
+    return [(rng.uniform(0, 360), rng.uniform(LOWEST, 60)) for _ in range(count)]
 
 
 class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
@@ -51,10 +74,10 @@ class TIMESPLAT_OT_add_cameras(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012
 
     rig: EnumProperty(name="Rig", items=RIGS)
-    count: IntProperty(name="Cameras", description="Of an orbit", default=8, min=1, max=64)
+    count: IntProperty(name="Cameras", description="Of an orbit, a dome or at random", default=12, min=1, max=64)
     elevation: FloatProperty(
-        name="Elevation", description="Above the horizon", default=0, min=-math.pi / 2, max=math.pi / 2,
-        subtype="ANGLE",
+        name="Elevation", description="Above the horizon, where all are level", default=0,
+        min=-math.pi / 2, max=math.pi / 2, subtype="ANGLE",
     )  # fmt: skip
     distance: FloatProperty(
         name="Distance",

@@ -21,6 +21,14 @@ PRESET_ITEMS = [
 ]
 
 
+def active(chosen) -> str | None:
+    """The preset that the settings are those of."""
+    for key, values in PRESETS.items():
+        if all(getattr(chosen, name) == value for name, value in values.items()):
+            return key
+    return None
+
+
 class TIMESPLAT_OT_preset(bpy.types.Operator):
     """Choose resolution, samples, method, quality and number of Gaussians at once"""
 

@@ -22,6 +22,7 @@ from .. import estimates, settings
 from ..asset.display import add_asset
 from ..asset.parenting import follow
 from ..asset.visibility import show
+from ..notices import refuse_views_from_outside
 from ..runtime import child_process, jobs, worker_options
 from ..runtime.capture import start_capture
 from .common import errors_reported
@@ -66,15 +67,17 @@ def request(chosen, context) -> dict:
     for ob in cameras:
         if ob.data.type != "PERSP":
             raise InputError(f"{ob.name}: the camera is not a perspective one; change its type or unselect it.")
+    objects = settings.objects(chosen, context)
+    method = settings.method(chosen, objects)
     return {
-        "objects": [o.name_full for o in settings.objects(chosen, context)],
+        "objects": [o.name_full for o in objects],
         "cameras": [o.name_full for o in cameras],
         "frames": list(settings.frames(chosen, context.scene)),
         "in_turn": chosen.in_turn,
         "size": chosen.size,
         "samples": chosen.samples,
-        "passes": getattr(chosen, "method", "") != "deform",
-        "tracks": getattr(chosen, "method", "") in ("", "tracks"),
+        "passes": method != "deform",
+        "tracks": (chosen.number if chosen.budget == "NUMBER" else 0) if method == "tracks" else None,
         "lighting": chosen.lighting,
     }
 
@@ -83,6 +86,8 @@ def start(chosen, context) -> jobs.Job:
     """Starts the Job that these settings ask for. Raises InputError before anything has been done."""
     python = worker_options.worker_python(context)
     shot = request(chosen, context)
+    refuse_views_from_outside(chosen, context)
+    method = settings.method(chosen, settings.objects(chosen, context))
     checkpoint = bpy.path.abspath(chosen.checkpoint) if getattr(chosen, "checkpoint", "") else ""
     if checkpoint and not Path(checkpoint).is_file():
         raise InputError(f"{checkpoint}: no such checkpoint; correct it, or leave it empty.")
@@ -101,9 +106,10 @@ def start(chosen, context) -> jobs.Job:
 
     # The operator is gone by the time that a stage or the end comes: what they need is taken from it now.
     look, size = chosen.look, chosen.size
+    number = chosen.number if chosen.budget == "NUMBER" else 0
     asked = {
         "task": "reconstruct",
-        "method": chosen.method,
+        "method": method,
         **settings.fit(chosen),
         "budget": settings.budget(chosen),
         "device": worker_options.device(context),
@@ -124,6 +130,8 @@ def start(chosen, context) -> jobs.Job:
         show(ob, originals.found(), "RESULT", bpy.context)
         ob["timesplat_lighting"] = shot["lighting"]
         said = f"{len(asset):,} Gaussians in {time.monotonic() - begun:.0f} s"
+        if number and len(asset) < 0.9 * number:
+            said += f" ({number:,} were asked for: more need a higher Resolution or Quality)"
         note = f" {event['note']}." if event.get("note") else ""
         if output:
             try:

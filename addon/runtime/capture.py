@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders the pictures, in a background Blender (`background_blender`). The request:
 objects    full names of what is captured       cameras    full names of cameras, or [] for those of `rig`
-rig, targets, seed   (optional) of `datagen.rigs`: default alternating, none, 0
+rig, targets, seed   (optional) of `datagen.rigs`: default coverage, none, 0
 frames     scene frames                         in_turn    one camera a frame, instead of all of them
 size, samples, passes, lighting                 as `datagen.render_setup.CaptureSettings` has them
-tracks     (optional) whether surfaces are followed (true)
+tracks     (optional) how many points of surfaces are followed, 0 for one a pixel (the default); None: none
 sequence   folder to write
 """
 
@@ -76,14 +76,14 @@ def _capture(request: dict, progress) -> dict:
     if cameras and not rig:
         shots = camera_shots(scene, cameras, frames, norm, request["in_turn"])
     else:
-        shots = rigs.RIGS[rig or "alternating"](numbers, seed)
+        shots = rigs.RIGS[rig or "coverage"](numbers, seed)
     shots += rigs.targets(numbers, seed, request.get("targets", 0))
 
     def rendered(done: int, total: int) -> None:
         progress(0.05 + 0.95 * done / total, f"rendering: picture {done} of {total}")
 
     wanted = {key: request[key] for key in ("size", "samples", "passes", "lighting")}
-    settings = CaptureSettings(**wanted, tracks=0 if request.get("tracks", True) else None)
+    settings = CaptureSettings(**wanted, tracks=request.get("tracks", 0))
     subject = Subject(frames, norm, aabb, objects)
     provenance = {"asset": request["name"], **tool_versions(), "scene_frames": frames}
     capture(shots, Path(request["sequence"]), subject, settings, provenance=provenance, progress=rendered)

@@ -16,6 +16,7 @@ from ...datagen.sequence import InputError
 from .folders import ADDON, runtime_folder
 
 _installed: dict | None = None  # what the runtime's own file says, read once and when a Job has changed it
+_named_there = False  # whether the Python that the preferences name was there when it was named
 _has_torch = importlib.util.find_spec("torch") is not None  # Blender's own Python; this looks and does not import
 
 
@@ -38,6 +39,23 @@ def reload_installed_runtime() -> None:
         _installed = {k: found[k] for k in ("python", "build", "versions", "bytes")}
     except (OSError, ValueError, KeyError, TypeError):
         _installed = None
+
+
+def named_python() -> str:
+    """The Python that the preferences name, or ""."""
+    preferences = addon_preferences()
+    return bpy.path.abspath(preferences.python) if preferences and preferences.python else ""
+
+
+def look_for_named_python() -> None:
+    """Looks whether it is there, for draw functions, which read no files."""
+    global _named_there
+    _named_there = bool(named := named_python()) and Path(named).is_file()
+
+
+def is_named_python_there() -> bool:
+    """As it was when it was named."""
+    return _named_there
 
 
 def worker_python(context=None) -> str:

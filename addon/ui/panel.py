@@ -2,13 +2,14 @@
 """The Timesplat tab in the 3D view's sidebar: what to capture, with which cameras, how to reconstruct it, what is
 under way. Drawing reads settings and nothing else: no file, no evaluated object."""
 
+import textwrap
+
 import bpy
 from bl_ui.utils import PresetPanel
 
 from ...datagen.sequence import InputError
-from .. import estimates, settings
-from ..operators import add_cameras
-from ..operators.presets import PRESET_ITEMS
+from .. import estimates, notices, settings
+from ..operators import add_cameras, presets
 from ..runtime import worker_options
 from ..runtime.folders import ADDON
 from . import job_rows
@@ -37,8 +38,9 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
     def draw(self, context):
         layout, chosen = self.layout, context.scene.timesplat
         row = layout.row(align=True)
-        for key, name, _ in PRESET_ITEMS:
-            row.operator("timesplat.preset", text=name).preset = key
+        active = presets.active(chosen)
+        for key, name, _ in presets.PRESET_ITEMS:
+            row.operator("timesplat.preset", text=name, depress=key == active).preset = key
         col = layout.column(align=True)
         try:
             expected = estimates.estimate(chosen, context)
@@ -51,6 +53,7 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row.label(text=f"about {_duration(seconds)}", icon="TIME")
             about = "at most" if chosen.budget == "NUMBER" else "about"
             col.label(text=f"{about} {_two_digits(expected.gaussians):,} Gaussians", icon="OUTLINER_OB_POINTCLOUD")
+            _draw_notices(layout, chosen, context, expected)
         if not worker_options.has_worker_python(context):
             row = layout.row(align=True)
             row.label(text="No runtime yet", icon="ERROR")
@@ -70,6 +73,8 @@ class TIMESPLAT_PT_capture(_Sidebar, bpy.types.Panel):
         layout, chosen = self.layout, context.scene.timesplat
         layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(chosen, "source")
+        if chosen.source == "SCENE":
+            layout.prop(chosen, "leave_out")
         if chosen.source == "COLLECTION":
             layout.prop_search(chosen, "collection", bpy.data, "collections", text=" ")
         layout.prop(chosen, "frame_range")
@@ -77,7 +82,10 @@ class TIMESPLAT_PT_capture(_Sidebar, bpy.types.Panel):
         if chosen.frame_range == "CUSTOM":
             col.prop(chosen, "frame_start")
             col.prop(chosen, "frame_end")
-        col.prop(chosen, "every")
+        row = col.row(align=True)
+        row.prop(chosen, "frame_step")
+        if chosen.every:
+            row.prop(chosen, "every", text="")
         col = layout.column(align=True)
         col.prop(chosen, "size")
         col.prop(chosen, "samples")
@@ -87,6 +95,7 @@ class TIMESPLAT_PT_capture(_Sidebar, bpy.types.Panel):
 class TIMESPLAT_PT_cameras(_Sidebar, bpy.types.Panel):
     bl_label = "Cameras"
     bl_parent_id = "TIMESPLAT_PT_panel"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context):
         layout, chosen = self.layout, context.scene.timesplat
@@ -95,13 +104,19 @@ class TIMESPLAT_PT_cameras(_Sidebar, bpy.types.Panel):
         if placed:
             layout.prop(chosen, "in_turn")
         grid = layout.grid_flow(columns=2, align=True, even_columns=True)
-        for key, name, _ in add_cameras.RIGS:
-            grid.operator("timesplat.add_cameras", text=name).rig = key
+        names = {key: name for key, name, _ in add_cameras.RIGS}
+        for key in (k for k in names if k not in add_cameras.ADVANCED):
+            grid.operator("timesplat.add_cameras", text=names[key]).rig = key
+        header, body = layout.panel("timesplat_advanced_rigs", default_closed=True)
+        header.label(text="Advanced")
+        for key in add_cameras.ADVANCED if body else ():
+            body.operator("timesplat.add_cameras", text=names[key]).rig = key
 
 
 class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
     bl_label = "Model"
     bl_parent_id = "TIMESPLAT_PT_panel"
+    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
 
     def draw(self, context):
         layout, chosen = self.layout, context.scene.timesplat
@@ -110,6 +125,8 @@ class TIMESPLAT_PT_model(_Sidebar, bpy.types.Panel):
         layout.prop(chosen, "quality")
         if chosen.quality == "SECONDS":
             layout.prop(chosen, "refine")
+            if not chosen.refine:
+                layout.label(text="0: no fit, but for fewer Gaussians", icon="INFO")
         layout.prop(chosen, "budget")
         if chosen.budget in ("SHARE", "NUMBER"):
             layout.prop(chosen, chosen.budget.lower(), text=" ")
@@ -142,6 +159,18 @@ def _reconstruct_button(layout, chosen) -> None:
     operator = layout.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
     for key in settings.KEYS:
         setattr(operator, key, getattr(chosen, key))
+
+
+def _draw_notices(layout, chosen, context, expected) -> None:
+    try:
+        said, icon = notices.notices(chosen, context, expected), "INFO"
+    except InputError as e:
+        said, icon = [str(e)], "ERROR"
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for sentence in said:
+        for i, line in enumerate(textwrap.wrap(sentence, 42)):
+            column.label(text=line, icon="BLANK1" if i else icon)
 
 
 def _menu(self, context):

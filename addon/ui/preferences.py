@@ -28,6 +28,7 @@ class TIMESPLAT_preferences(bpy.types.AddonPreferences):
         description="An interpreter with torch and the rest of timesplat[torch]. Empty: the installed runtime, else "
         "TIMESPLAT_PYTHON, else Blender's own",
         subtype="FILE_PATH",
+        update=lambda self, context: worker_options.look_for_named_python(),
     )
     checkpoint: StringProperty(
         name="Checkpoint",
@@ -50,7 +51,11 @@ def _draw_runtime(layout) -> None:
     box = layout.box()
     box.use_property_split = False
     runtime = worker_options.installed_runtime()
-    if runtime:
+    if named := worker_options.named_python():
+        there = worker_options.is_named_python_there()
+        said = f"{named} is used; Self-Test says whether it has all" if there else f"{named}: there is no such file"
+        wrapped_label(box, f"Python: {said}.", "CHECKMARK" if there else "ERROR")
+    elif runtime:
         versions = runtime["versions"]
         text = f"Runtime: torch {versions.get('torch')} ({runtime['build'].upper()})"
         box.label(text=f"{text}, {megabytes(runtime['bytes'])}", icon="CHECKMARK")
@@ -86,6 +91,7 @@ def _draw_progress(box, job) -> None:
 def register() -> None:
     bpy.utils.register_class(TIMESPLAT_preferences)
     worker_options.reload_installed_runtime()
+    worker_options.look_for_named_python()
 
 
 def unregister() -> None:

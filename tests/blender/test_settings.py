@@ -83,7 +83,7 @@ def test_what_the_settings_select(blender):
     assert told["selected"] == ["Child", "Empty", "Light"] and told["collected"] == ["Child", "Light"]
     assert told["own"] == [*range(1, 251, 7)] and told["estimates"] == [5 * 36, 36]
     assert told["said"] == [
-        "Front, left, back, right in turn", "5 selected cameras", "5 cameras of the rig", "1 selected camera",
+        "All sides, above and below in turn", "5 selected cameras", "5 cameras of the rig", "1 selected camera",
     ]  # fmt: skip
     from timesplat.model.fitting.refine import FROM_DEPTH
 

@@ -13,11 +13,12 @@ part("addon").register()
 presets, estimates, settings = part("addon.operators.presets"), part("addon.estimates"), part("addon.settings")
 reconstruct = part("addon.operators.reconstruct")
 chosen = bpy.context.scene.timesplat
-default, told, followed = [chosen.method, settings.fit(chosen)], {}, {}
+default, told, followed = [chosen.method, settings.fit(chosen), presets.active(chosen)], {}, {}
 for key, *_ in presets.PRESET_ITEMS:
     chosen.method, chosen.budget = "deform", "NUMBER"
     bpy.ops.timesplat.preset(preset=key)
     e = estimates.estimate(chosen, bpy.context)
+    assert presets.active(chosen) == key
     same = [getattr(chosen, k) == v for k, v in presets.PRESETS[key].items()]
     told[key] = [all(same), chosen.method, chosen.budget, settings.fit(chosen), chosen.size, e.reconstructing,
                  e.gaussians]
@@ -25,7 +26,8 @@ for method, *_ in settings.METHODS:
     chosen.method = method
     shot = reconstruct.request(chosen, bpy.context)
     followed[method] = [shot["tracks"], shot["passes"]]
-chosen.quality = "SECONDS"
+chosen.property_unset("quality")
+chosen.refine = 10.0  # a script that names seconds alone means them
 tell(default=default, presets=told, followed=followed, seconds=settings.fit(chosen), qualities=estimates.QUALITIES,
      most=estimates.MOST_STEPS, tracks=estimates.TRACK_STEPS)
 """
@@ -34,7 +36,8 @@ tell(default=default, presets=told, followed=followed, seconds=settings.fit(chos
 def test_the_presets(blender):
     told = blender(PRESETS)
     assert [n.lower() for n in told["presets"]] == list(QUALITIES)
-    assert told["default"] == ["tracks", {"quality": None, "refine": 10.0}] and told["seconds"] == told["default"][1]
+    assert told["default"] == ["tracks", {"quality": "balanced", "refine": 0.0}, "BALANCED"]
+    assert told["seconds"] == {"quality": None, "refine": 10.0}
     work = [(size, seconds, gaussians) for *_, size, seconds, gaussians in told["presets"].values()]
     assert work == sorted(work)
     for (name, quality), (*same, fit, size, _, gaussians) in zip(
@@ -43,7 +46,7 @@ def test_the_presets(blender):
         assert same == [True, "tracks", "ALL"] and fit == {"quality": name, "refine": 0.0}
         assert size == quality.size and gaussians <= quality.gaussians
     assert told["followed"] == {
-        "tracks": [True, True], "guided": [False, True], "lift": [False, True], "deform": [False, False],
+        "tracks": [0, True], "guided": [None, True], "lift": [None, True], "deform": [None, False],
     }  # fmt: skip
     assert set(told["followed"]) <= set(METHODS)
 

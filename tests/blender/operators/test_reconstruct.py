@@ -38,8 +38,10 @@ scene.render.resolution_x, scene.cycles.samples = 333, 77
 ball.rotation_euler.x = 0.5  # changed and not keyed
 before = [len(bpy.data.objects), len(bpy.data.scenes), len(bpy.data.cameras), len(bpy.data.worlds)]
 done = bpy.ops.timesplat.reconstruct(method="lift", every=2, size=48, samples=4, output=sys.argv[1], budget="ALL",
-                                     refine=0)
+                                     refine=0, look="Points")
 ob = bpy.context.object
+alone = [ball.hide_get(), ball.hide_render, part("addon.asset.visibility").shown(ob, bpy.context)]
+ball.hide_set(False)  # what is hidden is not evaluated; renders do not show it still
 same = [scene.frame_current == 9, scene.render.resolution_x == 333, scene.cycles.samples == 77,
         abs(ball.rotation_euler.x - 0.5) < 1e-6, bpy.data.filepath == ""]
 result = {}
@@ -59,7 +61,7 @@ second = bpy.ops.timesplat.reconstruct(method="deform", every=5, size=32, sample
 count = len(bpy.context.object.data.points if hasattr(bpy.context.object.data, "points") else
             bpy.context.object.data.vertices)
 tell(done=list(done), second=list(second), frames=result, before=before, after=after, left=os.listdir(runs),
-     same=same, torch="torch" in sys.modules, source=list(ob["timesplat_source"]), count=count)
+     same=same, alone=alone, torch="torch" in sys.modules, source=list(ob["timesplat_source"]), count=count)
 """
 
 
@@ -73,7 +75,8 @@ def test_a_ball_on_a_line(installed, tmp_path):
         np.testing.assert_allclose(mean, [x, 2, 3], atol=0.25)
         assert abs(radius - 0.5) < 0.12  # eight pictures of 48 pixels
     objects, *others = told["before"]
-    assert told["after"] == [objects + 1, *others] and told["left"] == [] and all(told["same"]), told
+    assert told["alone"] == [True, True, "RESULT"]
+    assert told["after"] == [objects + 2, *others] and told["left"] == [] and all(told["same"]), told
     assert told["source"] == ["Sphere"] and 1 <= told["count"] <= 50
     kept = read_ply(tmp_path / "kept.ply")
     assert (kept.clip.frame_start, kept.clip.frame_end, kept.clip.fps) == (5, 19, 30)
@@ -100,9 +103,10 @@ texture.image, texture.interpolation = image, "Closest"
 links.new(texture.outputs["Color"], next(n for n in nodes if n.type == "BSDF_PRINCIPLED").inputs["Base Color"])
 ball.data.materials.append(material)
 
-options = dict(method="tracks", samples=4, budget="ALL")
+options = dict(method="tracks", samples=4, budget="ALL", look="Points")
 bpy.ops.timesplat.reconstruct(every=2, size=48, refine=0.5, output=sys.argv[1], **options)
 ob = bpy.context.object
+ball.hide_set(False)
 off = {}
 for frame in (5, 12.5, 19):
     scene.frame_set(int(frame), subframe=frame % 1)
