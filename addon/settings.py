@@ -58,7 +58,7 @@ class Settings:
     )
     collection: StringProperty(name="Collection", description="The collection to capture")
     leave_out: BoolProperty(
-        name="Leave Out Surroundings",
+        name="No Surroundings",
         description="With Source at All: a ground, a backdrop or a dome that dwarfs all else is not captured. It would "
         "set the bounds, and what matters would be a few pixels",
         default=True,
@@ -222,7 +222,8 @@ def budget(settings) -> str | None:
 
 def quality(settings) -> str:
     """Of QUALITIES. Where a script names seconds to fit and no quality, it means these."""
-    only_seconds = settings.is_property_set("refine") and not settings.is_property_set("quality")
+    given = getattr(settings, "properties", settings)  # an operator's own are elsewhere
+    only_seconds = given.is_property_set("refine") and not given.is_property_set("quality")
     return "SECONDS" if only_seconds else settings.quality
 
 

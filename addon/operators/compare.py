@@ -15,12 +15,20 @@ from bpy.props import EnumProperty, IntProperty
 
 from ...datagen.scene.borrow import shown_objects
 from ...datagen.sequence import InputError
+from ..asset.sliders import asset_modifier, get_input
 from ..asset.visibility import show
 from ..runtime import background_blender, child_process, jobs
 from ..runtime.render_comparison import GAIN
 from .common import OnAsset, errors_reported
 
 IMAGE = "Timesplat Compare"
+OTHER_FRAMES = 4
+VERDICTS = (  # dB inside the object, from which on it looks like this
+    (34, "Hard to tell apart"),
+    (29, "Close; fine detail is softer"),
+    (24, "The same thing, visibly softer"),
+    (-1e9, "Far off"),
+)
 
 
 def originals_of(ob, context) -> list:
@@ -51,16 +59,38 @@ def start(ob, context, size: int, samples: int) -> jobs.Job:
         "view": None if scene.camera and scene.camera.type == "CAMERA" else _viewport_camera(context),
         "size": size,
         "samples": samples,
+        "frames": _other_frames(ob, scene.frame_current),
     }
 
     def finish(event: dict, folder: Path) -> str:
         show_image(to_image(np.load(folder / "compared.npy")), bpy.context)
-        return f"Original, reconstruction, {GAIN} times the difference: {event['psnr']:.1f} dB PSNR."
+        return in_words(event)
 
     def render(folder: Path) -> child_process.Child:
         return background_blender.start("addon.runtime.render_comparison", request, folder)
 
     return jobs.start("Compare", [render], finish)
+
+
+def _other_frames(ob, now: int) -> list[int]:
+    """OTHER_FRAMES frames of the clip, evenly over it, to look for the worst."""
+    modifier = asset_modifier(ob)
+    start, end = (get_input(modifier, f"Frame {x}") for x in ("Start", "End"))
+    found = {round(start + (end - start) * (i + 0.5) / OTHER_FRAMES) for i in range(OTHER_FRAMES)}
+    return sorted(found - {now})
+
+
+def in_words(event: dict) -> str:
+    """What a comparison came to, in a sentence."""
+    whole = f"The whole picture: {event['psnr']:.1f} dB PSNR"
+    if event["inside"] is None:
+        return f"{whole}; the object is not in it."
+    verdict = next(words for least, words in VERDICTS if event["inside"] >= least)
+    said = f"{verdict}: {event['inside']:.1f} dB inside the object. {whole}."
+    if len(event["frames"]) > 1:
+        frame, score = min(event["frames"].items(), key=lambda item: item[1])
+        said += f" Worst of {len(event['frames'])} frames: {frame}, {score:.1f} dB inside."
+    return f"{said} The picture: original, reconstruction, {GAIN} times their difference."
 
 
 def _viewport_camera(context) -> dict:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A Job: a chain of child processes that run one after another in a folder of the Job's own, their progress, their end
-and their log. Whatever happens, a Job that has ended leaves neither a process nor a file behind."""
+and their log, with what Blender writes when it crashes. Whatever happens, a Job that has ended leaves neither a process
+nor a file behind."""
 
 from __future__ import annotations
 
@@ -105,6 +106,8 @@ class Job:
         if self.child:
             self.child.kill()
         self._log = self.log_text()
+        if state == "failed":
+            self._log += run_folders.crash_logs(self.folder)
         self.message = message if state == "done" else f"{self._stays} {message}".strip()
         self.child, self.state, self.text = None, state, ""
         run_folders.remove(self.folder)

@@ -5,6 +5,7 @@ are. The request:
 asset, originals, lights   names of objects     even   Even Light, in place of the lights
 view       None (the scene's camera), or a camera as `data`, `matrix`, `width` and `height`
 size       pixels of the longer side            samples   Cycles samples a pixel of the original
+frames     others than the present one, to look for the worst at a part of the size
 """
 
 from __future__ import annotations
@@ -25,21 +26,39 @@ from . import background_blender
 
 SPLAT_SAMPLES = 2  # splats are smooth and glow by themselves: more samples change next to nothing
 GAIN = 4  # the difference is shown this many times as strong
+SMALLER = 2  # the other frames are rendered at the size divided by this
 
 
 def compare(request: dict, progress) -> dict:
     """Writes compared.npy, (height, 3 · width, 3) float32, sRGB-encoded, rows from the top: what the asset was made
-    from, the asset, GAIN times their absolute difference; returns the PSNR in dB over the whole picture."""
+    from, the asset, GAIN times their absolute difference. Returns PSNRs in dB: `psnr` over the whole picture, `inside`
+    over the pixels that either of them covers, and `frames`, the latter of each frame in which there are any."""
     scene = bpy.context.scene
     chosen = {key: [scene.objects[n] for n in request[key]] for key in ("originals", "lights")}
     view = _camera(scene, request["view"])
-    progress(0.1, "rendering the original")
-    truth = _picture(scene, [*chosen["originals"], *chosen["lights"]], view, request, request["samples"])
-    progress(0.6, "rendering the reconstruction")
-    asset = _picture(scene, [scene.objects[request["asset"]]], view, request, SPLAT_SAMPLES)
+    frames, now = request["frames"], (scene.frame_current, scene.frame_subframe)
+
+    def pair(frame: int, subframe: float, size: int, done: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both pictures, and which pixels they cover."""
+        taken, at = request | {"size": size}, (frame, subframe)
+        progress(done, f"rendering the original at frame {frame}")
+        truth, cover = _picture(scene, [*chosen["originals"], *chosen["lights"]], view, taken, request["samples"], at)
+        progress(done + 0.5 / (len(frames) + 1), f"rendering the reconstruction at frame {frame}")
+        asset, covered = _picture(scene, [scene.objects[request["asset"]]], view, taken, SPLAT_SAMPLES, at)
+        return truth, asset, np.maximum(cover, covered)[..., 0] > 0.5
+
+    truth, asset, inside = pair(*now, request["size"], 0.1)
     np.save("compared.npy", np.concatenate([truth, asset, np.minimum(GAIN * np.abs(truth - asset), 1)], 1))
-    error = float(((truth - asset) ** 2).mean())
-    return {"psnr": min(-10 * math.log10(max(error, 1e-12)), 120.0)}
+    told = {"psnr": _psnr(truth, asset), "inside": _psnr(truth[inside], asset[inside]) if inside.any() else None}
+    scores = {now[0]: told["inside"]}
+    for i, frame in enumerate(frames):
+        one, other, covered = pair(frame, 0.0, max(request["size"] // SMALLER, 16), (i + 1.1) / (len(frames) + 1.2))
+        scores[frame] = _psnr(one[covered], other[covered]) if covered.any() else None
+    return told | {"frames": {frame: score for frame, score in scores.items() if score is not None}}
+
+
+def _psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return min(-10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12)), 120.0)
 
 
 def _camera(scene, view: dict | None) -> tuple:
@@ -54,8 +73,11 @@ def _camera(scene, view: dict | None) -> tuple:
     return data, Matrix(view["matrix"]), view["width"], view["height"]
 
 
-def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> np.ndarray:
-    """(H,W,3) float32, sRGB-encoded, over white: the objects, shown whether or not they are hidden."""
+def _picture(
+    scene, objects: list, view: tuple, request: dict, samples: int, at: tuple[int, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H,W,3) float32, sRGB-encoded, over white, and (H,W,1) alpha: the objects at a frame and subframe, shown
+    whether or not they are hidden."""
     data, matrix, width, height = view
     scale = request["size"] / max(width, height)
     width, height = max(1, round(width * scale)), max(1, round(height * scale))
@@ -75,12 +97,12 @@ def _picture(scene, objects: list, view: tuple, request: dict, samples: int) -> 
         camera.matrix_world = matrix
         stage.collection.objects.link(camera)
         stage.camera = camera
-        stage.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+        stage.frame_set(at[0], subframe=at[1])
         stage.render.filepath = str(Path.cwd() / "frame")
         with bpy.context.temp_override(scene=stage):
             bpy.ops.render.render(write_still=True)
     rgba = to_straight_srgb(read_multilayer(Path("frame.exr"))["combined"]) / np.float32(255)
-    return rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+    return rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]), rgba[..., 3:]
 
 
 if __name__ == "__main__":

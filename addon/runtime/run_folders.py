@@ -13,10 +13,21 @@ from pathlib import Path
 from ...datagen.whole_folders import WINDOWS
 from .folders import user_folder
 
+MOST_OF_A_CRASH = 20_000  # characters: the end, where the call stack is
+
 
 def make() -> Path:
     """A new, empty folder of this Blender's. Raises OSError."""
     return Path(tempfile.mkdtemp(prefix=f"run-{os.getpid()}-", dir=user_folder("runs")))
+
+
+def crash_logs(folder: Path) -> str:
+    """What Blenders that crashed in the folder left there, which is their folder for temporary files."""
+    texts = []
+    for path in sorted(folder.glob("**/*.crash.txt")):
+        with contextlib.suppress(OSError):
+            texts.append(f"\n{path.name}\n{path.read_text(encoding='utf-8', errors='replace')[-MOST_OF_A_CRASH:]}\n")
+    return "".join(texts)
 
 
 def remove(folder: Path) -> None:

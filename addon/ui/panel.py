@@ -169,7 +169,7 @@ def _draw_notices(layout, chosen, context, expected) -> None:
     column = layout.column(align=True)
     column.scale_y = 0.8
     for sentence in said:
-        for i, line in enumerate(textwrap.wrap(sentence, 42)):
+        for i, line in enumerate(textwrap.wrap(sentence, 34)):
             column.label(text=line, icon="BLANK1" if i else icon)
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Original, reconstruction and difference in one picture; the scene is as it was."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,8 @@ truth, asset, difference = thirds(image)
 told["truth"], told["asset"] = [[at(a, 48, 32), at(a, 4, 4)] for a in (truth, asset)]
 told["gain"] = float(np.abs(difference - np.minimum(4 * np.abs(truth - asset), 1)).max())
 told["said"] = part("addon.runtime.jobs").JOBS[-1].message
+covered = np.minimum(truth, asset)[..., 1] < (1 + 0.35) / 2  # half red, half white
+told["inside"] = float(-10 * np.log10(np.mean(((truth - asset) ** 2)[covered])))
 told["expected"] = float(-10 * np.log10(np.mean((truth - asset) ** 2)))
 told["left"] = os.listdir(part("addon.runtime.folders").user_folder("runs"))
 def right():
@@ -107,7 +111,9 @@ def test_compare(blender, tmp_path):
     np.testing.assert_allclose(told["truth"], [srgb, [1, 1, 1]], atol=0.01)  # what is hidden is rendered
     np.testing.assert_allclose(told["asset"], [one["rgb"][0], [1, 1, 1]], atol=0.02)  # as splats, over white
     assert told["gain"] < 0.02  # the image has 8 bits
-    psnr = float(told["said"].split()[-3])
+    inside, psnr, worst = (float(x) for x in re.findall(r"([0-9.]+) dB", told["said"]))
     assert psnr == pytest.approx(told["expected"], abs=0.06) and 8 < psnr < 30 and told["left"] == []
+    assert inside == pytest.approx(told["inside"], abs=0.3) and worst <= inside < psnr, "the background is easy"
+    assert told["said"].startswith("Far off: ") and "Worst of 5 frames: " in told["said"]
     assert told["again"] == ["Timesplat Compare"]
     assert min(told["cube"][0]) > 0.99 and max(told["cube"][1]) < 0.95  # unnamed, all but assets is the original
