@@ -11,6 +11,7 @@ from ..datagen.scene.borrow import shown_objects
 from ..datagen.sequence import InputError
 from . import survey
 from .asset.sliders import LOOKS
+from .asset.visibility import HIDDEN
 
 RIG_COLLECTION = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
 MOST_AUTOMATIC_FRAMES = 24  # frames that "every: automatic" comes near to
@@ -184,6 +185,7 @@ def left_out(settings, context) -> list:
 def captured_shapes(context) -> list:
     """The objects that renders show, without lights, cameras and asset objects."""
     found = shown_objects(context.scene, context.view_layer)
+    found = [o for o in found if not o.hide_render or o.get(HIDDEN)]
     return [o for o in found if not o.get("timesplat") and o.type not in ("LIGHT", "CAMERA")]
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders a comparison by Cycles, in a background Blender (`background_blender`): what an asset was made from, the
-asset, and their difference; as the capture rendered it: with Even Light where that was on, over white, colours as they
-are. The request:
-asset, originals, lights   names of objects     even   Even Light, in place of the lights
+asset, and their difference; as the capture rendered it: with Studio Lighting where that was on, over white, colours as
+they are. The request:
+asset, originals, lights   names of objects     even   Studio Lighting, in place of the lights
 view       None (the scene's camera), or a camera as `data`, `matrix`, `width` and `height`
 size       pixels of the longer side            samples   Cycles samples a pixel of the original
 frames     others than the present one, to look for the worst at a part of the size

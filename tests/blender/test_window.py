@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from timesplat.model.io import slices
 from timesplat.model.io.asset import Clip
@@ -53,6 +54,8 @@ tell()
 """
 JOBS = "[(j.state, j.fraction, j.text, j.message) for j in ours('addon.runtime.jobs').JOBS]"
 STATE = "[(s.name, s.frame_current, s.render.resolution_x, s.camera) for s in bpy.data.scenes], len(bpy.data.cameras)"
+SPACE = "next(a.spaces.active for a in bpy.context.window_manager.windows[0].screen.areas if a.type == 'VIEW_3D')"
+SHADING = f"[getattr({SPACE}.shading, x) for x in ('type', 'light', 'color_type')]"
 ENDED = f"[s for s, *_ in {JOBS} if s not in ('running', 'waiting')]"
 
 
@@ -72,6 +75,13 @@ def socket(name: str) -> str:
     """Asks for the identifier of the asset's slider of this name."""
     tree = "bpy.context.object.modifiers[0].node_group.interface.items_tree"
     return f"[i.identifier for i in {tree} if i.name == {name!r}][0]"
+
+
+def orange(w: Window, view: dict) -> int:
+    """How many pixels of the 3D view have the monkey's hue."""
+    image = np.asarray(Image.open(w.picture("orange")).convert("RGB")).astype(int)
+    part = image[view["y"] : view["y"] + view["h"], view["x"] : view["x"] + view["w"] // 2]
+    return int(((part[..., 0] > 120) & (part[..., 0] > 1.4 * part[..., 1]) & (part[..., 1] > 1.2 * part[..., 2])).sum())
 
 
 def processes(folder: Path) -> list[str]:
@@ -121,11 +131,15 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         w.wait_for(ENDED, 300)
         assert w.ask(JOBS)[-1][0] == "done", w.ask(JOBS)
         w.wait_for("bpy.context.object.get('timesplat')")
+        assert w.ask("[o.hide_get() for o in bpy.data.objects if o.name == 'Suzanne']") == [True]
+        w.press("timesplat.show_colours")
+        assert w.ask(SHADING) == ["SOLID", "FLAT", "VERTEX"]
         view = w.area("VIEW_3D")
         w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
         time.sleep(0.7)
-        w.key("shift+h", "Home")  # hides all but the result, and frames it
+        w.key("Home")  # frames it
         w.picture("done")
+        assert orange(w, view) > 2000, "it is there, in its own colour"
         count = int(w.ask(JOBS)[-1][3].split()[0].replace(",", ""))
         assert count > 200
         assert w.ask(STATE) == before
@@ -147,11 +161,8 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         w.key("Left", "Left")
         assert w.ask("bpy.context.scene.frame_current") == seen[-1] - 1
 
-        # a slider: the wheel brings the result's panel up
+        # a slider, in sight at the top
         side = w.region("VIEW_3D", "UI")
-        w.move(side["x"] + 100, side["y"] + 500)
-        time.sleep(0.7)
-        w.wheel(-15)
         cut = w.ask(socket("Opacity Cut"))
         w.fill(cut, "0.3", across=0.7)
         value = w.under(side["x"] + 0.7 * (side["w"] - 28), w.place[1])
@@ -189,13 +200,11 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
     shutil.copy(tmp_path / "monkey.blend", tmp_path / "other.blend")
     with window(tmp_path / "monkey.blend", TIMESPLAT_PYTHON=sys.executable) as w:
         region = w.sidebar()
-        x = region["x"] + 0.5 * (region["w"] - 28)
-        button = w.find("timesplat.reconstruct", x, 100, 400)
         view = w.area("VIEW_3D")
 
         def start(seen: str) -> None:
             jobs = len(w.ask(JOBS))
-            w.click(x, button)
+            w.press("timesplat.reconstruct")
             w.wait_for(f"len({JOBS}) == {jobs + 1} and {seen!r} in {JOBS}[-1][2]", 120)
 
         def over_the_view(*keys: str) -> None:
@@ -217,7 +226,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
 
         start("reconstruct")
         cross = region["x"] + region["w"] - 45
-        w.click(cross, w.find("timesplat.cancel", cross, button + 10, button + 60))
+        w.click(cross, w.find("timesplat.cancel", cross, w.place[1] + 10, w.place[1] + 60))
         w.wait_for(f"{JOBS}[-1][0] == 'cancelled'", 5)
         alone()
         w.picture("cancelled while reconstructing")
@@ -232,7 +241,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
         over_the_view("ctrl+z")
         assert w.ask("[o.name for o in bpy.data.objects]") == ["Suzanne"]  # the result is one step of undo
         over_the_view("ctrl+shift+z")
-        w.wait_for("len(bpy.data.objects) == 2")
+        w.wait_for("len(bpy.context.scene.objects) == 2")
         over_the_view("ctrl+s")
         alone()
 
@@ -244,7 +253,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
         w.sidebar()
         w.picture("waiting in another file")
         assert w.ask("len(bpy.data.objects)") == 1
-        w.click(cross - 46, w.find("timesplat.bring", cross - 46, button + 10, button + 60))
+        w.click(cross - 46, w.find("timesplat.bring", cross - 46, 150, 500))
         w.wait_for("bpy.context.object.get('timesplat')")
         w.picture("brought in")
         alone()
@@ -282,16 +291,12 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
         view = w.area("VIEW_3D")
         assert w.ask(COUNT) == 400
 
-        def scrolled(operator: str) -> None:
-            w.move(side["x"] + 100, side["y"] + 500)
-            time.sleep(0.7)
-            w.wheel(-15)
-            w.press(operator, top=300)
-
+        x = side["x"] + 0.75 * (side["w"] - 28)
+        w.click(x, w.find("timesplat.export_asset", x, 100, 500) + 68)  # unfolds Edit
         w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
         time.sleep(0.7)
         w.key("shift+h", "Home")  # the result alone, filling the view
-        scrolled("timesplat.delete_rectangle")
+        w.press("timesplat.delete_rectangle")
         middle = view["x"] + view["w"] / 2, view["y"] + view["h"] / 2
         w.drag(middle[0], middle[1] - 300, middle[0] - 500, middle[1] + 350)
         w.wait_for(f"{COUNT} < 400")
@@ -305,7 +310,7 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
         w.key("ctrl+shift+z")
         w.wait_for(f"{COUNT} == {left}")
 
-        scrolled("timesplat.bake")
+        w.press("timesplat.bake")
         w.move(w.place[0], w.place[1] - 40)  # from the dialog's first field to its title
         time.sleep(0.7)
         w.key("Return")
@@ -313,7 +318,7 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
         assert w.ask(COUNT) <= left
         w.picture("baked")
 
-        scrolled("timesplat.compare")
+        w.press("timesplat.compare", across=0.25)
         w.wait_for(f"{JOBS} and {JOBS}[-1][0] not in ('running', 'waiting')", 120)
         assert w.ask(JOBS)[-1][0] == "done" and "PSNR" in w.ask(JOBS)[-1][3], w.ask(JOBS)
         w.wait_for("any(a['kind'] == 'IMAGE_EDITOR' for x in look() for a in x['areas'])")
@@ -330,6 +335,8 @@ def test_a_rig_is_put_and_undone_while_the_view_renders(window, tmp_path):
         view = w.area("VIEW_3D")
         rig = "[o.name for o in bpy.data.objects if o.type == 'CAMERA']"
         across = region["x"] + 0.25 * (region["w"] - 28)
+        light = w.find("timesplat.lighting", region["x"] + 0.6 * (region["w"] - 28), 300, 700, "ctrl+shift+c")
+        w.click(across, light + 32)  # unfolds Cameras
         button = w.find("rig='CANONICAL'", across, 300, region["y"] + region["h"], step=8)
 
         def over_the_view(*keys: str) -> None:
