@@ -120,6 +120,14 @@ class Settings:
 KEYS = tuple(Settings.__annotations__)
 
 
+def _get_step(settings) -> int:
+    return int(settings.every > 0)
+
+
+def _set_step(settings, value: int) -> None:
+    settings.every = max(settings.every, 1) if value else 0
+
+
 class TIMESPLAT_PG_settings(Settings, bpy.types.PropertyGroup):
     frame_step: EnumProperty(
         name="Frame Step",
@@ -128,8 +136,8 @@ class TIMESPLAT_PG_settings(Settings, bpy.types.PropertyGroup):
             ("AUTO", "Auto", f"As many as there may be with an even step: at most {MOST_AUTOMATIC_FRAMES}"),
             ("EVERY", "Every", "Every n-th"),
         ],
-        get=lambda self: int(self.every > 0),
-        set=lambda self, value: setattr(self, "every", value and max(self.every, 1)),
+        get=_get_step,
+        set=_set_step,
     )
 
 

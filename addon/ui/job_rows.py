@@ -7,6 +7,7 @@ import textwrap
 
 from ..runtime import jobs
 
+LONGEST = 40  # characters of a line
 STATE_ICONS = {"waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
 
 
@@ -18,13 +19,14 @@ def draw_jobs(layout) -> None:
         if job.state == "running":
             row.progress(factor=job.fraction, text=job.text)
         else:
-            text = job.message if job.state == "done" else f"{job.label}: {job.message or job.text}"
+            long = len(job.message) > LONGEST
+            text = job.message if job.state == "done" and not long else f"{job.label}: {job.message or job.text}"
             row.label(text=text, icon=STATE_ICONS[job.state])
         if job.state == "waiting":
             row.operator("timesplat.bring", text="", icon="IMPORT").number = job.number
         row.operator("timesplat.log", text="", icon="TEXT").number = job.number
         if job.active:
             row.operator("timesplat.cancel", text="", icon="X").number = job.number
-        elif job.state == "failed" and len(job.message) > 40:
-            for line in textwrap.wrap(job.message, 44):
+        elif len(job.message) > LONGEST:
+            for line in textwrap.wrap(job.message, LONGEST):
                 box.label(text=line)

@@ -20,6 +20,10 @@ DEVICES = [
 SHOWN_VERSIONS = ("numba", "numpy", "usd-core", "OpenEXR")
 
 
+def _look_for_python(preferences, context) -> None:
+    worker_options.look_for_named_python()
+
+
 class TIMESPLAT_preferences(bpy.types.AddonPreferences):
     bl_idname = ADDON
 
@@ -28,7 +32,7 @@ class TIMESPLAT_preferences(bpy.types.AddonPreferences):
         description="An interpreter with torch and the rest of timesplat[torch]. Empty: the installed runtime, else "
         "TIMESPLAT_PYTHON, else Blender's own",
         subtype="FILE_PATH",
-        update=lambda self, context: worker_options.look_for_named_python(),
+        update=_look_for_python,
     )
     checkpoint: StringProperty(
         name="Checkpoint",

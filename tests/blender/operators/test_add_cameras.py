@@ -35,6 +35,14 @@ EXPECTED = {
     "CANONICAL": ({}, rigs.canonical(NUMBERS)),
     "ROTATING": ({}, rigs.rotating(NUMBERS)),
     "TURNTABLE": ({"elevation": np.radians(20)}, rigs.turntable(NUMBERS)),
+    "DOME": (
+        {"count": 3, "distance": 4.0},
+        [
+            rigs.Shot(f, f"dome{k}", "", rigs.spherical(137.508 * k, np.degrees(np.arcsin(height)), 4))
+            for f in NUMBERS
+            for k, height in enumerate(np.linspace(-0.5, np.sin(np.radians(75)), 7)[1::2])
+        ],
+    ),
     "ORBIT": (
         {"count": 3, "distance": 4.0, "elevation": np.radians(-10)},
         [rigs.Shot(f, f"orbit{k}", "", rigs.spherical(120 * k, -10, 4)) for f in NUMBERS for k in range(3)],

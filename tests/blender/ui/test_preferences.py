@@ -24,14 +24,21 @@ drawn = draw()
 buttons.last_job.state, buttons.last_job.message = "failed", "No room."
 drawn += draw()
 watching = False
+prefs.python = sys.executable
+named, there = draw(), [options.is_named_python_there()]
+prefs.python = "/nowhere/python"
+gone = draw()
+there.append(options.is_named_python_there())
 jobs.JOBS.clear()
-tell(files=files, drawn=drawn)
+tell(there=there, named=named, gone=gone, files=files, drawn=drawn)
 """
 
 
 def test_drawing_reads_no_file(installed):
     told = installed(BUTTONS + DRAW)
     assert told["files"] == []
+    assert told["there"] == [True, False] and "not installed" not in told["named"]
+    assert "Python: /nowhere/python: there is no such file." in told["gone"]
     for words in ("'checkpoint'", "torch 2 (CPU), 500 MB", "numpy 2", "factor=0.5", "No room."):
         assert words in told["drawn"], words
     for operator in ("install_runtime", "uninstall_runtime", "self_test", "cancel", "log"):
