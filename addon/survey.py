@@ -107,8 +107,10 @@ def without_surface(objects: list) -> dict:
 
 def mostly_without_surface(objects: list) -> bool:
     """Whether what has no surface makes up half of it, by size."""
+    if not (unseen := without_surface(objects)):
+        return False
     sizes = {ob: _ball([points])[1] for ob in objects if len(points := _corners(ob))}
-    return 2 * sum(sizes.get(ob, 0) for ob in without_surface(objects)) >= sum(sizes.values()) > 0
+    return 2 * sum(sizes.get(ob, 0) for ob in unseen) >= sum(sizes.values()) > 0
 
 
 def _kind(material) -> str | None:

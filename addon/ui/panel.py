@@ -3,6 +3,7 @@
 under way. Drawing reads settings and nothing else: no file, no evaluated object."""
 
 import textwrap
+import time
 
 import bpy
 from bl_ui.utils import PresetPanel
@@ -13,6 +14,9 @@ from ..operators import add_cameras, presets
 from ..runtime import worker_options
 from ..runtime.folders import ADDON
 from . import job_rows
+
+MANY = 50  # objects, of which it takes milliseconds to find out
+FRESH_SECONDS = 2.0
 
 
 class TIMESPLAT_PT_presets(PresetPanel, bpy.types.Panel):
@@ -161,11 +165,26 @@ def _reconstruct_button(layout, chosen) -> None:
         setattr(operator, key, getattr(chosen, key))
 
 
-def _draw_notices(layout, chosen, context, expected) -> None:
+_last_notices: tuple = (0.0, None, ([], "INFO"))  # when, of what, and what was said
+
+
+def _notices(chosen, context, expected) -> tuple[list[str], str]:
+    """Sentences and their icon; in a scene of many objects those of a moment ago, for the panel is drawn often."""
+    global _last_notices
+    of = context.scene.name, len(context.scene.objects), *(getattr(chosen, key) for key in settings.KEYS)
+    when, what, said = _last_notices
+    if len(context.scene.objects) > MANY and what == of and time.monotonic() - when < FRESH_SECONDS:
+        return said
     try:
-        said, icon = notices.notices(chosen, context, expected), "INFO"
+        said = notices.notices(chosen, context, expected), "INFO"
     except InputError as e:
-        said, icon = [str(e)], "ERROR"
+        said = [str(e)], "ERROR"
+    _last_notices = time.monotonic(), of, said
+    return said
+
+
+def _draw_notices(layout, chosen, context, expected) -> None:
+    said, icon = _notices(chosen, context, expected)
     column = layout.column(align=True)
     column.scale_y = 0.8
     for sentence in said:
