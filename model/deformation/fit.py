@@ -34,7 +34,7 @@ from .thin import thinned
 
 LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
-PER_PIXEL = 4  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view
+PER_PIXEL = 2  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view
 MAX_GAUSSIANS = 100_000
 SCENE_START = 10_000  # Gaussians at the start of a whole scene
 
@@ -43,11 +43,11 @@ SCENE_START = 10_000  # Gaussians at the start of a whole scene
 class DeformFit:
     """How a cloud and its motion are fitted; rates of Adam at the start and at the end, those of places in pixels."""
 
-    xyz: tuple[float, float] = (0.5, 0.01)
-    scale: tuple[float, float] = (3e-2, 2e-3)
+    xyz: tuple[float, float] = (0.5, 0.02)
+    scale: tuple[float, float] = (3e-2, 4e-3)
     rotation: tuple[float, float] = (1e-2, 1e-3)
-    rgb: tuple[float, float] = (2e-2, 1e-3)
-    opacity: tuple[float, float] = (5e-2, 5e-3)
+    rgb: tuple[float, float] = (2e-2, 2e-3)
+    opacity: tuple[float, float] = (5e-2, 1e-2)
     motion: tuple[float, float] = (0.08, 0.0036)  # in steps of a frame in model time: the more frames, the slower
     start: int = 1000  # Gaussians at the start
     first_views: int = 8  # nearest to the middle of the clip, or all of one moment, which say where these are
@@ -64,7 +64,7 @@ class DeformFit:
 
 FIT = DeformFit()
 SMALLEST = 128  # pixels of the longest side, from which pictures grow to what they are
-SHARES = {1: (0.6,), 2: (0.5, 0.8), 3: (0.4, 0.7, 0.9)}  # of the schedule after which they do, by how often
+SHARES = {1: (0.6,), 2: (0.6, 0.85), 3: (0.5, 0.8, 0.93)}  # of the schedule after which they do, by how often
 
 
 def pyramid_of(longest: int) -> Pyramid:

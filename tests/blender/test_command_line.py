@@ -50,9 +50,11 @@ def command(installed, tmp_path):
 
 def test_render(command, tmp_path):
     code, said = command("render", "--out", tmp_path / "s", "--size", 16, "--samples", 1, "--targets", 1, "--every", 1)
-    assert code == 0 and "8 pictures" in said, said
+    assert code == 0 and "28 pictures" in said, said
     seq = read_sequence(tmp_path / "s")
-    assert seq.width == 16 and seq.tracks and len(seq.select(rig="alternating")) == len(seq.select(rig="target")) == 4
+    assert (
+        seq.width == 16 and seq.tracks and len(seq.select(rig="coverage")) == 24 and len(seq.select(rig="target")) == 4
+    )
     np.testing.assert_allclose(seq.normalisation.translation, [3, 0, 0], atol=1e-5)
 
 

@@ -20,7 +20,7 @@ atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwis
 display, sliders, edit, holding = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit", "asset_object"))
 ply = part("model.io.ply")
 folder = sys.argv[1] + os.sep
-ob = display.add_asset(ply.read_ply(folder + "in.ply"), "Walk. 1")
+ob = display.add_asset(ply.read_ply(folder + "in.ply"), "Walk. 1", look="Points")
 scene = bpy.context.scene
 def save(name, **options):
     try:
@@ -256,7 +256,7 @@ scene.frame_set(20)
 done = [save("now.ply"), save("a.usdz"), save("b.usda", mode="frames", half=True), save("c.usdc", mode="points")]
 want = at(range(10, 34))
 scene.frame_set(5)
-done.append(list(bpy.ops.timesplat.import_asset(filepath=folder + "a.usdz")))
+done.append(list(bpy.ops.timesplat.import_asset(filepath=folder + "a.usdz", look="Points")))
 ob = bpy.context.object
 got = at(range(10, 34))
 done.append(save("again.usdc"))

@@ -222,7 +222,7 @@ kept = job in jobs.JOBS and job.state
 quiet = jobs._may_come_in(job)
 done = bpy.ops.timesplat.bring(number=job.number) if kept == "waiting" else []
 tell(before=before, kept=kept, quiet=quiet, done=list(done), message=job.message,
-     clouds=sum("timesplat" in o for o in bpy.data.objects), left=os.listdir(runs), processes=family())
+     clouds=sum("timesplat" in o for o in bpy.context.scene.objects), left=os.listdir(runs), processes=family())
 """
 
 
