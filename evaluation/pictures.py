@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +23,16 @@ def grid(rows: dict[str, torch.Tensor], columns: list[str]) -> Image.Image:
     """{label: (n,H,W,3) pictures 0..1} and n column titles -> one labelled picture, a row per label."""
     n, height, width = next(iter(rows.values())).shape[:3]
     font = ImageFont.load_default(13)
-    sheet = Image.new("RGB", (LABEL + n * (width + MARGIN), 20 + len(rows) * (height + MARGIN)), "white")
+    left = max(LABEL, *(8 + math.ceil(font.getlength(label)) for label in rows))
+    sheet = Image.new("RGB", (left + n * (width + MARGIN), 20 + len(rows) * (height + MARGIN)), "white")
     pen = ImageDraw.Draw(sheet)
     for i, title in enumerate(columns):
-        pen.text((LABEL + i * (width + MARGIN) + 4, 3), title, fill="black", font=font)
+        pen.text((left + i * (width + MARGIN) + 4, 3), title, fill="black", font=font)
     for j, (label, images) in enumerate(rows.items()):
         y = 20 + j * (height + MARGIN)
         pen.text((4, y + height // 2 - 8), label, fill="black", font=font)
         for i in range(n):
-            sheet.paste(Image.fromarray(as_bytes(images[i])), (LABEL + i * (width + MARGIN), y))
+            sheet.paste(Image.fromarray(as_bytes(images[i])), (left + i * (width + MARGIN), y))
     return sheet
 
 
