@@ -9,7 +9,7 @@ from .settings import picture_count
 from .settings import quality as quality_of
 
 # Gaussians a pixel that counts (`_pixels_that_count`): the mean of 12 objects (tracks: 7, deform: 4), until one is made
-_gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "deform": 0.4}
+_gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "deform": 0.2}
 TRACKED = (4000, 100_000)  # fewest and most points that are followed
 START_SECONDS = 3.0  # of a process
 FIT_SECONDS = 5.0  # of a budget's own fit, of pictures of USUAL_PIXELS

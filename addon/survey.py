@@ -18,9 +18,7 @@ DWARFS, DWARFS_FAR = 2.0, 4.0  # how many times larger than all else a flat one 
 FLAT = 0.02  # of the longest side
 FEW_FACES = 2000  # of a dome or backdrop
 FREE = 1.5  # half-sizes of all else that lie between it and a dome or backdrop
-WALL = (
-    3  # level and upward directions at least in which a dome or backdrop is seen: a table is not, from what lies on it
-)
+WALL = 3  # level and upward directions at least in which a dome or backdrop is seen: more than in which a table is
 DIRECTIONS = [Vector(d).normalized() for d in product((-1, 0, 1), repeat=3) if any(d)]
 MOVING = {"ARMATURE", "CLOTH", "SOFT_BODY", "HOOK", "LATTICE", "MESH_DEFORM", "SURFACE_DEFORM", "CURVE", "NODES"}
 TIMED = {"CLOTH", "SOFT_BODY", "FLUID", "OCEAN", "WAVE", "BUILD", "EXPLODE", "MESH_SEQUENCE_CACHE", "DYNAMIC_PAINT",

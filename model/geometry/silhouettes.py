@@ -23,7 +23,7 @@ def points_inside(views: Views, count: int, generator: torch.Generator, share: f
     while total < count:
         points = HALF_SIDE * (2 * torch.rand(tried, 3, generator=generator) - 1)
         framed, seen, colour = _seen(chosen, points)
-        inside = (framed >= FRAMED * len(chosen)) & (seen >= share * framed) if share > 0 else framed >= 0
+        inside = (framed >= FRAMED * len(chosen)) & (seen >= share * framed) | (share <= 0)
         if inside.sum() < LEAST_SHARE * tried:
             share -= 0.1
             continue
