@@ -35,12 +35,15 @@ def compare(request: dict, progress) -> dict:
     over the pixels that either of them covers, and `frames`, the latter of each frame in which there are any."""
     scene = bpy.context.scene
     chosen = {key: [scene.objects[n] for n in request[key]] for key in ("originals", "lights")}
-    view = _camera(scene, request["view"])
+    camera = _camera(scene, request["view"])
     frames, now = request["frames"], (scene.frame_current, scene.frame_subframe)
 
     def pair(frame: int, subframe: float, size: int, done: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Both pictures, and which pixels they cover."""
-        taken, at = request | {"size": size}, (frame, subframe)
+        taken, at, view = request | {"size": size}, (frame, subframe), camera
+        if not request["view"]:
+            scene.frame_set(frame, subframe=subframe)  # for the camera may move
+            view = (view[0], scene.camera.matrix_world.copy(), *view[2:])
         progress(done, f"rendering the original at frame {frame}")
         truth, cover = _picture(scene, [*chosen["originals"], *chosen["lights"]], view, taken, request["samples"], at)
         progress(done + 0.5 / (len(frames) + 1), f"rendering the reconstruction at frame {frame}")

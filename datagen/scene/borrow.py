@@ -60,6 +60,7 @@ def borrowed(objects: list | None = None, *, lights: bool = True) -> Iterator:
     finally:
         if bpy.app.background:
             stage.user_remap(source)
+        stage.render.use_persistent_data = False  # what a renderer keeps would look into the scene that is gone
         bpy.data.scenes.remove(stage)
         if bpy.app.background:
             source.frame_set(source.frame_current, subframe=source.frame_subframe)

@@ -76,6 +76,13 @@ def right():
     return at(thirds(bpy.data.images["Timesplat Compare"])[0], 83, 32)
 told["cube"] = [right()]
 told["again"] = [i.name for i in bpy.data.images if i.name.startswith("Timesplat")]
+for frame, turned in ((6, np.pi), (7, 0), (7.5, 0), (8.5, np.pi)):  # before and after it looks elsewhere
+    camera.rotation_euler.z = turned
+    camera.keyframe_insert("rotation_euler", frame=frame)
+right()
+told["moved"] = part("addon.runtime.jobs").JOBS[-1].message
+camera.animation_data_clear()
+camera.rotation_euler.z = 0
 del ob["timesplat_source"]
 told["cube"].append(right())
 ob["timesplat_source"] = ["gone"]
@@ -116,4 +123,7 @@ def test_compare(blender, tmp_path):
     assert inside == pytest.approx(told["inside"], abs=0.3) and worst <= inside < psnr, "the background is easy"
     assert told["said"].startswith("Far off: ") and "Worst of 5 frames: " in told["said"]
     assert told["again"] == ["Timesplat Compare"]
+    assert "dB inside the object" in told["moved"] and "Worst of" not in told["moved"], (
+        "frames are seen as they are then"
+    )
     assert min(told["cube"][0]) > 0.99 and max(told["cube"][1]) < 0.95  # unnamed, all but assets is the original
