@@ -338,6 +338,21 @@ def view(args: argparse.Namespace) -> int:
     return run(args)
 
 
+def video_arguments(p: argparse.ArgumentParser) -> None:
+    from .model.film_command import add_arguments
+
+    add_arguments(p)
+
+
+def video(args: argparse.Namespace) -> int:
+    """Film an asset: a turntable that plays while it turns, or what cameras see, as .mp4, animated .webp or pictures
+    with alpha."""
+    from .model.film_command import run
+
+    with _bar() as progress:
+        return run(args, progress)
+
+
 # ---------------------------------------------------------------- evaluate, bench, demo
 
 
@@ -437,6 +452,7 @@ COMMANDS = {
     "reconstruct": (reconstruct_arguments, reconstruct, "a Sequence to a 4D Gaussian asset"),
     "export": (export_arguments, export, "an asset to USD, a web page or .blend"),
     "view": (view_arguments, view, "play an asset in the browser"),
+    "video": (video_arguments, video, "film an asset: .mp4, .webp, pictures"),
     "evaluate": (evaluate_arguments, evaluate, "score methods on held-out views"),
     "bench": (bench_arguments, bench, "speed against accuracy, in charts"),
     "stress": (stress_arguments, stress, "where methods fail, in charts"),

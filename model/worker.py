@@ -11,16 +11,25 @@ to do; null or "" is the same as leaving a key out:
         refine      seconds of fitting (0) …        budget      "N", "P%" or "auto"
         max_loss    dB that "auto" may lose (0.1)   … which for tracks are all that there are
         done: asset, gaussians, method, note (what the artist should know; a sentence or nothing)
-    export          USD, where Blender has none     (never imports torch)
-        asset       .ply to read                    out         .usd* to write
+    export          what Blender lacks libraries for (never imports torch)
+        asset       .ply to read                    out         .usd*, .4dgs, or .sog of a frame, to write
+        frame       of a .sog
         mode        splats | points | frames        half        true or false
         original    .usd* of the object, for a variant beside the reconstruction
         motion      .npy with where the asset is taken at each frame (see write_usd)
+        suffix      with folders for asset and out: each slice of the one as this kind into the other
         done: out, complaints (the validator's, a list of sentences), bytes
     import          the other way round             (never imports torch)
-        source      .usd* to read                   asset       .ply to write
+        source      .usd*, .4dgs or .sog to read    asset       .ply to write
+        sources     the files of a sequence, of which source is one, with fps and frame_start
         motion      .npy to write where the asset moves as a whole (see load_usd)
-        done: asset, gaussians
+        done: asset, gaussians, up, note
+    video           a film (see film.py)
+        asset       .ply to read                    out         .mp4, .webp or a new folder to write
+        cameras     .json of film_command.read_cameras, in place of a turntable that plays `plays` times
+        size        [width, height]                 fps         pictures a second (the clip's)
+        background  as rrggbb, or none (white)
+        done: out, pictures
     selftest        does this interpreter reconstruct?
         device, checkpoint
         done: report (a list of lines)
@@ -56,10 +65,12 @@ _KEYS = {
     "task": "text", "watch": "true or false", "sequence": "text", "asset": "text", "method": "text",
     "device": "text", "checkpoint": "text", "indices": "list", "refine": "number", "budget": "text",
     "max_loss": "number", "out": "text", "mode": "text", "half": "true or false", "source": "text",
-    "original": "text", "motion": "text", "quality": "text",
+    "original": "text", "motion": "text", "quality": "text", "frame": "number", "suffix": "text", "sources": "list",
+    "fps": "number", "frame_start": "number", "cameras": "text", "size": "list", "plays": "number",
+    "background": "text",
 }  # fmt: skip
 _NEEDED = {"reconstruct": ("sequence", "asset"), "export": ("asset", "out"), "import": ("source", "asset")}
-_NEEDED |= {"selftest": ()}
+_NEEDED |= {"video": ("asset", "out"), "selftest": ()}
 
 
 def main(argv: list[str]) -> int:
@@ -78,7 +89,13 @@ def main(argv: list[str]) -> int:
         task = request.setdefault("task", "reconstruct")
         if request.get("watch"):
             threading.Thread(target=_leave_when_closed, args=[_take_stdin()], daemon=True).start()
-        do = {"reconstruct": _reconstruct, "export": _export, "import": _import, "selftest": _selftest}[task]
+        do = {
+            "reconstruct": _reconstruct,
+            "export": _export,
+            "import": _import,
+            "video": _video,
+            "selftest": _selftest,
+        }[task]
         say("done", **do(request, progress), seconds=round(time.monotonic() - start, 3))
     except InputError as e:
         say("error", message=str(e))
@@ -147,26 +164,33 @@ def _reconstruct(request: dict, progress) -> dict:
 
 
 def _export(request: dict, progress) -> dict:
+    from .io.files import frame_files, read_asset, upright, write_asset
     from .io.ply import read_ply
+    from .io.slices import write_moments
     from .io.usd_apart import limit_memory
     from .io.usd_check import check_usd
-    from .io.usd_write import write_usd
+    from .io.usd_stage import USD_SUFFIXES
 
     limit_memory()
     out = Path(request["out"])
+    if "suffix" in request:
+        paths = frame_files(request["asset"])
+        moments = ((int(p.stem.rsplit("_", 1)[1]), upright(read_asset(p))) for p in paths)
+        count = write_moments(out, moments, out.name, cut=0, suffix=request["suffix"])
+        return {"out": request["out"], "complaints": [], "files": count}
     progress(0.0, "reading the asset")
     asset = read_ply(request["asset"])
     progress(0.2, f"writing {out.name}")
-    write_usd(
-        out,
-        asset,
-        mode=request.get("mode", "splats"),
-        half=request.get("half", False),
-        original=request.get("original"),
-        motion=_matrices(request["motion"]) if "motion" in request else None,
-    )
+    options: dict = {}
+    usd = out.suffix.lower() in USD_SUFFIXES
+    if usd:
+        options = {k: request[k] for k in ("mode", "half", "original") if k in request}
+        options |= {"motion": _matrices(request["motion"])} if "motion" in request else {}
+    elif "frame" in request:
+        options = {"frame": request["frame"], "cut": 0}
+    write_asset(out, asset, **options)
     progress(0.7, f"checking {out.name}")
-    return {"out": request["out"], "complaints": check_usd(out), "bytes": out.stat().st_size}
+    return {"out": request["out"], "complaints": check_usd(out) if usd else [], "bytes": out.stat().st_size}
 
 
 def _matrices(path: str) -> np.ndarray:
@@ -177,18 +201,43 @@ def _matrices(path: str) -> np.ndarray:
 
 
 def _import(request: dict, progress) -> dict:
+    from .io.files import read_frames
     from .io.ply import write_ply
     from .io.usd_apart import limit_memory
     from .io.usd_read import load_usd
+    from .io.usd_stage import USD_SUFFIXES
 
     limit_memory()
-    progress(0.0, f"reading {Path(request['source']).name}")
-    loaded = load_usd(request["source"])
+    source = Path(request["source"])
+    progress(0.0, f"reading {source.name}")
+    if source.suffix.lower() in USD_SUFFIXES:
+        loaded = load_usd(source)
+    else:
+        fps, start = request.get("fps", 24.0), int(request.get("frame_start", 1))
+        loaded = read_frames(request.get("sources") or [source], fps=fps, frame_start=start)
     progress(0.7, "writing the asset")
     write_ply(request["asset"], loaded.asset)
     if loaded.motion is not None and "motion" in request:
         np.save(request["motion"], loaded.motion)
-    return {"asset": request["asset"], "gaussians": len(loaded.asset), "note": loaded.note}
+    told = {"up": loaded.up, "note": loaded.note}
+    return {"asset": request["asset"], "gaussians": len(loaded.asset), **told}
+
+
+def _video(request: dict, progress) -> dict:
+    from .film import Look, check_look, placed, turntable, write_film
+    from .film_command import background, read_cameras
+    from .io.ply import read_ply
+
+    progress(0.0, "reading the asset")
+    out, asset = Path(request["out"]), read_ply(request["asset"])
+    width, height = map(int, request.get("size", (512, 512)))
+    look = Look(width, height, request.get("fps", asset.clip.fps), background(request.get("background"), out))
+    check_look(out, look)
+    if "cameras" in request:
+        shots = placed(read_cameras(Path(request["cameras"])), asset)
+    else:
+        shots = turntable(asset, look.fps, int(request.get("plays", 0)) or None)
+    return {"out": request["out"], "pictures": write_film(out, asset, shots, look, progress)}
 
 
 def _selftest(request: dict, progress) -> dict:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""File > Export > 4D Gaussians: the active asset object as .ply, USD, a web page, .splat, .spz or .glb, where and as
-it is now.
+"""File > Export > 4D Gaussians: the active asset object as any file that `timesplat export` writes, where and as it is
+now.
 
     bpy.ops.timesplat.export_asset(filepath="a.usdz", half=True)          the suffix says the format
-    bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame
+    bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES")    a folder with a 3DGS .ply a frame, or …
+    bpy.ops.timesplat.export_asset(filepath="frames", format="SLICES", kind="SOG")    … a file of another kind
 
 What the sliders do and what was deleted is in the file, and so is the object's place in the world: at each frame in
-USD and in a folder of slices, else at the current one. Animated sliders are followed by slices alone. USD is written
-by the worker, or where there is none with the pxr of Blender's own Python.
+USD and in a folder of slices, else at the current one. Animated sliders are followed by slices alone. What Blender
+lacks libraries for is written by the worker, USD where there is none with the pxr of Blender's own Python.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from ...datagen.sequence import InputError
 from ...model.io import slices
 from ...model.io.asset import Asset
-from ...model.io.files import WRITABLE, write_asset
+from ...model.io.files import APART, WRITABLE, named, write_asset
 from ...model.io.placement import place_asset, rest_and_motion
 from ...model.io.ply import write_ply
+from ...model.io.slice_formats import SLICE_FORMATS
 from ...model.io.usd_check import check_usd
 from ..asset.apply_sliders import moment, with_sliders
 from ..asset.asset_object import asset_of, slider_values
@@ -38,21 +40,29 @@ from .original_usd import original_usd
 REPORT = "Timesplat USD report"
 SUFFIXES = {
     **{"PLY": ".ply", "USDC": ".usdc", "USDA": ".usda", "USDZ": ".usdz"},
-    **{"PAGE": ".html", "SLICE": ".ply", "SPLAT": ".splat", "SPZ": ".spz", "GLB": ".glb", "SLICES": ""},
+    **{"FOURDGS": ".4dgs", "PAGE": ".html"},
+    **{"SLICE": ".ply", "SPLAT": ".splat", "SPZ": ".spz", "SOG": ".sog", "GLB": ".glb", "SLICES": ""},
 }
-MOMENTS = ("SLICE", "SPLAT", "SPZ", "GLB")  # which hold the current frame
+MOMENTS = ("SLICE", "SPLAT", "SPZ", "SOG", "GLB")  # which hold the current frame
 FORMAT_ITEMS = [
     ("PLY", "4D PLY", "Timesplat's own: a 3DGS .ply with motion and lifetimes. Nothing is lost"),
     ("USDC", "USDC (binary)", "USD for pipelines"),
     ("USDA", "USDA (text)", "USD to look into: large"),
     ("USDZ", "USDZ (package)", "USD in one file with all it needs"),
+    (
+        "FOURDGS",
+        ".4dgs",
+        "Straight 4D Gaussians for players of 4dgs.dev. Paths become pieces; needs the package fourdgs",
+    ),
     ("PAGE", "Web Page", "One file that plays in any browser, from disk and without network"),
     ("SLICE", "3DGS PLY, this frame", "For 3DGS viewers and tools: what is visible at the current frame"),
     ("SPLAT", ".splat, this frame", "For web viewers: what is visible at the current frame, in 32 bytes a Gaussian"),
     ("SPZ", ".spz, this frame", "Niantic's packed splats: what is visible at the current frame, in few bytes"),
+    ("SOG", ".sog, this frame", "PlayCanvas's packed splats: what is visible at the current frame, in few bytes"),
     ("GLB", ".glb, this frame", "glTF with KHR_gaussian_splatting: what is visible at the current frame"),
     ("SLICES", "3DGS PLY, all frames", "A new folder with what the timeline shows at every frame of the scene"),
 ]
+KIND_ITEMS = [(key, SUFFIXES[key], f"A {SUFFIXES[key]} for every frame") for key in MOMENTS]
 MODE_ITEMS = [
     ("splats", "Splats", "A Gaussian splat prim, which older readers take as points"),
     ("points", "Points", "A points prim only, for files that are referenced into others and for older readers"),
@@ -83,19 +93,37 @@ def places_and_changes(ob, frames: range, context) -> tuple[np.ndarray, list[str
 
 def write_usd(path: Path, asset: Asset, *, mode: str, half: bool, original: Path | None, motion, context) -> list[str]:
     """Writes and validates; returns what the validators complain about. Raises InputError."""
-    python = worker_options.usd_python(context)
-    if not python:
+    if not worker_options.python_for(path.suffix.lower(), context):
         write_asset(path, asset, mode=mode, half=half, original=original, motion=motion)
         return check_usd(path)
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
+        options = {"mode": mode, "half": half} | ({"original": str(original)} if original else {})
+        if motion is not None:
+            options["motion"] = str(Path(folder) / "motion.npy")
+            np.save(options["motion"], motion)
+        return write_apart(path, asset, context, **options)["complaints"]
+
+
+def write_apart(path: Path, asset: Asset, context, **options) -> dict:
+    """Has the worker write the asset; returns what it told. Raises InputError."""
+    python = worker_options.python_for(path.suffix.lower(), context)
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "asset.ply"
         write_ply(copy, asset)
-        request = {"task": "export", "asset": str(copy), "out": str(path.resolve()), "mode": mode, "half": half}
-        request |= {"original": str(original)} if original else {}
-        if motion is not None:
-            request["motion"] = str(Path(folder) / "motion.npy")
-            np.save(request["motion"], motion)
-        return child_process.ask_worker(python, request)["complaints"]
+        request = {"task": "export", "asset": str(copy), "out": str(path.resolve()), **options}
+        return child_process.ask_worker(python, request)
+
+
+def write_frames(path: Path, moments, suffix: str, context) -> int:
+    """Writes a folder with a file for each (frame, asset); returns their number. Raises InputError."""
+    if suffix not in APART:
+        return slices.write_moments(path, moments, path.name, cut=0, suffix=suffix)
+    python = worker_options.python_for(suffix, context)
+    with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
+        frames = Path(folder) / "frames"
+        slices.write_moments(frames, moments, path.name, cut=0)
+        request = {"task": "export", "asset": str(frames), "out": str(path.resolve()), "suffix": suffix}
+        return child_process.ask_worker(python, request)["files"]
 
 
 def with_suffix(filepath: str, kind: str) -> str:
@@ -115,7 +143,7 @@ def format_of(filepath: str, default: str) -> str:
 
 
 class TIMESPLAT_OT_export_asset(bpy.types.Operator):
-    """Export the active 4D Gaussian asset: as .ply, .splat, USD or a web page"""
+    """Export the active 4D Gaussian asset: for Blender, USD pipelines, splat viewers, game engines or browsers"""
 
     bl_idname = "timesplat.export_asset"
     bl_label = "Export 4D Gaussians"
@@ -127,6 +155,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         default=";".join(sorted({f"*{s}" for s in (*WRITABLE, *SUFFIXES.values()) if s})), options={"HIDDEN"}
     )
     format: EnumProperty(name="Format", items=FORMAT_ITEMS, default="PLY")
+    kind: EnumProperty(name="Files", description="What there is one of a frame", items=KIND_ITEMS, default="SLICE")
     apply_sliders: BoolProperty(
         name="Apply Sliders",
         description="Retiming, crop, density, lifetimes and opacity cut go into the file. Off: all the object holds",
@@ -170,6 +199,8 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         layout = self.layout
         layout.use_property_split, layout.use_property_decorate = True, False
         layout.prop(self, "format")
+        if self.format == "SLICES":
+            layout.prop(self, "kind")
         layout.prop(self, "apply_sliders")
         if self.format.startswith("USD"):
             layout.prop(self, "mode")
@@ -203,25 +234,29 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
         frame = scene.frame_current_final
         if self.format in MOMENTS:
             part = moment(ob, asset_of(ob), frame, self.apply_sliders)
-            count = write_asset(path, part, frame=frame, cut=0)
+            if path.suffix in APART:
+                write_apart(path, part, context, frame=frame)
+            else:
+                write_asset(path, part, frame=frame, cut=0)
             if not part.opacity.any():
                 return "WARNING", f"Nothing is shown at frame {frame:g}; one clear Gaussian stands in."
-            return "INFO", f"{count} Gaussians of frame {frame:g}."
+            return "INFO", f"{len(part)} Gaussians of frame {frame:g}."
         if self.format == "SLICES":
             asset = asset_of(ob)
             frames = range(scene.frame_start, scene.frame_end + 1) if self.apply_sliders else asset.clip.frames
             steps = visit_frames(frames, context)
             moments = ((f, moment(ob, asset, f, self.apply_sliders)) for f in steps)
             with closing(steps):
-                return "INFO", f"{slices.write_moments(path, moments, path.name, cut=0)} files."
+                return "INFO", f"{write_frames(path, moments, SUFFIXES[self.kind], context)} files."
 
         asset = with_sliders(ob) if self.apply_sliders else asset_of(ob)
         now = np.array(ob.matrix_world)
         places, animated = places_and_changes(ob, asset.clip.frames, context)
         rest, motion = rest_and_motion(places)
         lost = animated if self.apply_sliders else []
-        if self.format in ("PLY", "PAGE"):
-            write_asset(path, with_place(asset, now))
+        if self.format in ("PLY", "PAGE", "FOURDGS"):
+            placed = with_place(asset, now)
+            write_apart(path, placed, context) if path.suffix in APART else write_asset(path, placed)
             lost = lost + ["place"] * (motion is not None)
             level, said = "INFO", f"{len(asset)} Gaussians."
         elif self.with_original:
@@ -247,7 +282,7 @@ class TIMESPLAT_OT_export_asset(bpy.types.Operator):
 
 
 def _menu(self, context):
-    self.layout.operator("timesplat.export_asset", text="4D Gaussians (.ply, .usd, .html, .splat, .spz, .glb)")
+    self.layout.operator("timesplat.export_asset", text=f"4D Gaussians ({named((*WRITABLE, *SLICE_FORMATS))})")
 
 
 def register() -> None:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """File > Import > 4D Gaussians, also by dropping files on a 3D view, and headless:
 
-    bpy.ops.timesplat.import_asset(filepath="a.ply")                                  or .splat, .spz, .usd*
-    bpy.ops.timesplat.import_asset(filepath="folder/")                                its .ply files, one a frame
+    bpy.ops.timesplat.import_asset(filepath="a.ply")                                  or any other of READABLE
+    bpy.ops.timesplat.import_asset(filepath="folder/")                                its .ply, .sog, …, one a frame
     bpy.ops.timesplat.import_asset(directory="folder", files=[{"name": "a.ply"}, …])  these, one a frame
 
-USD is read by the worker, or where there is none with the pxr of Blender's own Python.
+What Blender lacks libraries for is read by the worker, USD where there is none with the pxr of Blender's own Python.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mathutils import Matrix, Quaternion
 
 from ...datagen.sequence import InputError
 from ...model.io.asset import VISIBLE, LoadedAsset
-from ...model.io.files import READABLE, frame_files, read_frames
+from ...model.io.files import FRAME_SUFFIXES, READABLE, frame_files, named, read_frames
 from ...model.io.ply import read_ply
 from ...model.io.usd_stage import USD_SUFFIXES
 from ..asset import display
@@ -35,7 +35,7 @@ LOOK_ITEMS = [
     ("Splats", "Splats", "Soft ellipsoids, as the asset was fitted: slower"),
 ]
 UP_ITEMS = [
-    ("AUTO", "Automatic", "Z in Timesplat's own files, Y in .spz, -Y in other .ply and .splat, as 3DGS has it"),
+    ("AUTO", "Automatic", "Z in Timesplat's own files, Y in .spz, -Y in other .ply, .splat and .sog, as 3DGS has it"),
     ("Z", "Z", "As in Blender: nothing is turned"),
     ("Y", "Y", "As in glTF and .spz"),
     ("-Y", "-Y", "As in 3D Gaussian Splatting and other photogrammetry"),
@@ -44,22 +44,24 @@ TURN_ABOUT_X = {"Z": 0, "Y": math.pi / 2, "-Y": -math.pi / 2}  # radians
 
 
 def read_assets(paths: list[Path], *, fps: float, frame_start: int, context=None) -> LoadedAsset:
-    """One asset from a file of any kind, or from several that are one frame each (see `files.read_frames`); a USD file
-    by the worker, where there is one. Raises InputError."""
-    python = worker_options.usd_python(context) if any(p.suffix.lower() in USD_SUFFIXES for p in paths) else None
-    if not python or len(paths) > 1 or not paths[0].is_file():
+    """One asset from a file of any kind, or from several that are one frame each (see `files.read_frames`); by the
+    worker what `python_for` says. Raises InputError."""
+    path, several = paths[0], len(paths) > 1
+    python = worker_options.python_for(path.suffix.lower(), context)
+    if not python or not path.is_file() or (several and path.suffix.lower() in USD_SUFFIXES):
         return read_frames(paths, fps=fps, frame_start=frame_start)
-    (path,) = paths
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as folder:
         copy, moves = Path(folder) / "asset.ply", Path(folder) / "motion.npy"
         request = {"task": "import", "source": str(path.resolve()), "asset": str(copy), "motion": str(moves)}
+        if several:
+            request |= {"sources": [str(p.resolve()) for p in paths], "fps": fps, "frame_start": frame_start}
         try:
             told = child_process.ask_worker(python, request)
         except InputError as e:
             if not str(e).startswith("The process "):
                 raise  # it named the file
-            raise InputError(f"{path}: the USD library gave up on it; it is damaged, export it again. {e}.") from None
-        return LoadedAsset(read_ply(copy), "Z", told["note"], np.load(moves) if moves.exists() else None)
+            raise InputError(f"{path}: the library gave up on it; it is damaged, export it again. {e}.") from None
+        return LoadedAsset(read_ply(copy), told["up"], told["note"], np.load(moves) if moves.exists() else None)
 
 
 def key_motion(ob, frames: range, motion: np.ndarray) -> bool:
@@ -89,7 +91,10 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO", "PRESET"}  # noqa: RUF012
 
     filepath: StringProperty(
-        name="File", description="A file, or a folder with a .ply a frame", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="File",
+        description=f"A file, or a folder of {named(FRAME_SUFFIXES)}, one a frame",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
     files: CollectionProperty(
@@ -147,7 +152,7 @@ class TIMESPLAT_OT_import_asset(bpy.types.Operator):
         if names := [f.name for f in self.files if f.name]:
             return [Path(bpy.path.abspath(self.directory)) / name for name in names]
         if not self.filepath:
-            raise InputError("No file was chosen; choose one, or a folder with a .ply a frame.")
+            raise InputError("No file was chosen; choose one, or a folder with a file a frame.")
         path = Path(bpy.path.abspath(self.filepath))
         return frame_files(path) if path.is_dir() else [path]
 
@@ -195,7 +200,7 @@ class TIMESPLAT_FH_splats(bpy.types.FileHandler):
 
 
 def _menu(self, context):
-    self.layout.operator("timesplat.import_asset", text="4D Gaussians (.ply, .splat, .spz, .usd)")
+    self.layout.operator("timesplat.import_asset", text=f"4D Gaussians ({named(READABLE)})")
 
 
 CLASSES = (TIMESPLAT_OT_import_asset, TIMESPLAT_FH_splats)

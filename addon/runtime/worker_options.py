@@ -13,6 +13,8 @@ from pathlib import Path
 import bpy
 
 from ...datagen.sequence import InputError
+from ...model.io.files import APART
+from ...model.io.usd_stage import USD_SUFFIXES
 from .folders import ADDON, runtime_folder
 
 _installed: dict | None = None  # what the runtime's own file says, read once and when a Job has changed it
@@ -87,15 +89,18 @@ def has_worker_python(context=None) -> bool:
     return bool((preferences and preferences.python) or _installed or os.environ.get("TIMESPLAT_PYTHON") or _has_torch)
 
 
-def usd_python(context=None) -> str | None:
-    """The interpreter that reads and writes USD: the worker's, which knows splats and has their validator, and where
-    a damaged file harms nothing; None where there is none, but Blender's own has pxr. Raises InputError otherwise."""
+def python_for(suffix: str, context=None) -> str | None:
+    """The interpreter that reads and writes files of a suffix; None: Blender's own. For those of APART it is the
+    worker's, which has the libraries, and where a damaged file harms nothing; where there is none, USD is left to
+    Blender's own pxr. Raises InputError where that lacks it too."""
+    if suffix not in APART:
+        return None
     try:
         return worker_python(context)
-    except InputError:
-        if importlib.util.find_spec("pxr"):
+    except InputError as e:
+        if suffix in USD_SUFFIXES and importlib.util.find_spec("pxr"):
             return None
-        raise
+        raise InputError(f"{suffix} is read and written by Timesplat's runtime. {e}") from None
 
 
 def checkpoint(context=None) -> str | None:

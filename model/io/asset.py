@@ -145,9 +145,9 @@ _WIDTHS = {"xyz": 3, "velocity": 3, "scale": 3, "rotation": 4, "rgb": 3}
 @dataclass(frozen=True)
 class LoadedAsset:
     """What a file held. `up`: the axis that points up in it, "Z" in our own files and in what is read from USD, "Y" in
-    .spz as Niantic defines it, "-Y" in .ply and .splat, which say nothing, as in the captures that 3DGS is trained on.
-    `motion`: (F,4,4) where the asset is taken at each frame of its clip, in the world, from where the clip places it;
-    None where it does not move as a whole."""
+    .spz as Niantic defines it, "-Y" in .ply, .splat and .sog, which say nothing, as in the captures that 3DGS is
+    trained on. `motion`: (F,4,4) where the asset is taken at each frame of its clip, in the world, from where the clip
+    places it; None where it does not move as a whole."""
 
     asset: Asset
     up: str

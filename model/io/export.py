@@ -13,20 +13,16 @@ from typing import TYPE_CHECKING
 from ...datagen.sequence import InputError
 
 if TYPE_CHECKING:
-    from .asset import LoadedAsset
+    from .asset import Asset, LoadedAsset
 
 
 def add_export_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", type=Path, help=".ply that `timesplat reconstruct` wrote, or another "
-                   "file of Gaussians: 3DGS .ply, .splat, .spz, USD; or a folder with a .ply a frame")  # fmt: skip
-    p.add_argument(
-        "out",
-        type=Path,
-        nargs="?",
-        help=".usdc, .usda, .usdz, .ply, .html (a page that plays it), .blend to write; "
-        ".splat, .spz, .glb with --frame",
-    )
-    _up_argument(p)
+    from .files import FRAME_SUFFIXES, WRITABLE, named
+    from .slice_formats import SLICE_FORMATS
+
+    add_asset_arguments(p)
+    p.add_argument("out", type=Path, nargs="?", help=f"{named(WRITABLE)} or .blend to write (.html: a page that "
+                   f"plays it); with --frame {named(SLICE_FORMATS)}")  # fmt: skip
     p.add_argument("--mode", choices=["splats", "points", "frames"], default="splats", help="USD: splats that old "
                    "readers take as points (default), points alone, or splats sampled at every frame")  # fmt: skip
     p.add_argument("--half", action="store_true", help="USD: half precision")
@@ -35,15 +31,17 @@ def add_export_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--pieces", action="store_true", help="write straight 4D Gaussians in place of tracks, for readers "
                    "that know no paths")  # fmt: skip
     p.add_argument("--check", action="store_true", help="USD: exit with 1 if the validator complains")
-    p.add_argument("--frame", type=float, help="write this moment alone, as 3DGS .ply, .splat, .spz or .glb")
-    p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a 3DGS .ply a frame into a new folder")
+    p.add_argument("--frame", type=float, help=f"write this moment alone, as {named(SLICE_FORMATS)}")
+    p.add_argument("--sequence", type=Path, metavar="FOLDER", help="write a file a frame into a new folder")
+    p.add_argument("--suffix", choices=SLICE_FORMATS, help="of --sequence's files (default: .ply, as 3DGS has it); "
+                   f"folders of {named(FRAME_SUFFIXES)} are read again")  # fmt: skip
 
 
 def export(args: argparse.Namespace) -> int:
     """`timesplat export`: 0, or 1 where the validator complains and --check was given. Raises InputError."""
     import tempfile
 
-    from .files import WRITABLE, write_asset
+    from .files import STRAIGHT, WRITABLE, named, write_asset
     from .slice_formats import SLICE_FORMATS
     from .slices import write_slices
     from .usd_check import check_usd
@@ -57,6 +55,8 @@ def export(args: argparse.Namespace) -> int:
         raise InputError(f"{args.out or args.sequence}: --mode, --half, --original and --check are for USD; drop them.")
     if args.frame is not None and (usd or args.sequence):
         raise InputError("export: --frame is for one moment's file, as .ply or .splat; drop it.")
+    if args.suffix and not args.sequence:
+        raise InputError("export: --suffix is for the files of --sequence; drop it, or name a folder.")
     if args.pieces and (args.sequence or args.frame is not None):
         raise InputError("export: --pieces is for what has time, not for moments; drop it.")
     loaded = _read(args.asset, args.up)
@@ -64,7 +64,7 @@ def export(args: argparse.Namespace) -> int:
     if loaded.motion is not None and not usd:
         print(f"{args.asset}: it moves as a whole; what is written stands where that starts, USD would keep it")
     if args.sequence:
-        print(f"{args.sequence}: {write_slices(args.sequence, asset, args.asset.stem)} files")
+        print(f"{args.sequence}: {write_slices(args.sequence, asset, args.asset.stem, args.suffix or '.ply')} files")
         return 0
     if suffix == ".blend" and args.frame is None:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -74,13 +74,15 @@ def export(args: argparse.Namespace) -> int:
     elif suffix not in WRITABLE and args.frame is None and suffix in SLICE_FORMATS:
         raise InputError(f"{args.out}: {suffix} holds one moment; say which by --frame.")
     elif suffix not in WRITABLE and args.frame is None:
-        raise InputError(f"{args.out}: cannot write that; choose {', '.join(WRITABLE)} or .blend.")
+        raise InputError(f"{args.out}: cannot write that; choose {named(WRITABLE)} or .blend.")
     else:
         options = {}
         if usd:
             options = {"mode": args.mode, "half": args.half, "motion": loaded.motion}
             options |= {"original": args.original, "original_start": args.original_start}
         count = write_asset(args.out, asset, frame=args.frame, pieces=args.pieces, **options)
+    if suffix in STRAIGHT and asset.paths is not None:
+        print(f"{args.out}: it knows no paths, so that {len(asset)} Gaussians on paths are {count} straight ones")
     print(f"{args.out}: {count} Gaussians, {args.out.stat().st_size / 1e6:.1f} MB")
     complaints = check_usd(args.out) if usd else []
     for complaint in complaints:
@@ -102,10 +104,20 @@ def _read(path: Path, up: str | None) -> LoadedAsset:
     return replace(loaded, asset=upright(loaded, up), up="Z")
 
 
-def _up_argument(p: argparse.ArgumentParser) -> None:
+def read_upright(path: Path, up: str | None) -> Asset:
+    """What a file holds, with Z up; what is to be said of it is printed. Raises InputError."""
+    return _read(path, up).asset
+
+
+def add_asset_arguments(p: argparse.ArgumentParser) -> None:
+    """The file to read, and what is up in it."""
+    from .files import FRAME_SUFFIXES, READABLE, named
+
+    p.add_argument("asset", type=Path, help=f"what `timesplat reconstruct` wrote, or another file of Gaussians: "
+                   f"{named(READABLE)}; or a folder of {named(FRAME_SUFFIXES)}, one a frame")  # fmt: skip
     p.add_argument("--up", choices=["Z", "Y", "-Y"], help="what points up in the file (default: Z in Timesplat's own "
-                   "and in USD, Y in .spz, -Y in other .ply and .splat, which say nothing, as in captures that 3DGS "
-                   "is trained on)")  # fmt: skip
+                   "and in USD, what a .4dgs says, Y in .spz, -Y in other .ply, .splat and .sog, which say nothing, as "
+                   "in captures that 3DGS is trained on)")  # fmt: skip
 
 
 def save_blend(asset: Path, out: Path) -> None:
@@ -120,9 +132,7 @@ def save_blend(asset: Path, out: Path) -> None:
 
 
 def add_view_arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("asset", type=Path, help="what `timesplat export` reads: .ply, .splat, .spz, USD, .html, or a "
-                   "folder with a .ply a frame")  # fmt: skip
-    _up_argument(p)
+    add_asset_arguments(p)
 
 
 def view(args: argparse.Namespace) -> int:
@@ -132,7 +142,7 @@ def view(args: argparse.Namespace) -> int:
 
     from .files import write_asset
 
-    asset = _read(args.asset, args.up).asset
+    asset = read_upright(args.asset, args.up)
     page = Path(tempfile.mkdtemp(prefix="timesplat-")) / f"{args.asset.resolve().stem}.html"
     write_asset(page, asset)
     print(f"{page}: {len(asset)} Gaussians, {page.stat().st_size / 1e6:.1f} MB")

@@ -14,11 +14,14 @@ import numpy as np
 
 from ...datagen.sequence import InputError
 from .asset import ARRAYS, MAX_GAUSSIANS, ONE_FRAME_SIGMA, STATIC_SIGMA_T, Asset, Clip, LoadedAsset, check
+from .fourdgs_file import read_4dgs, write_4dgs
 from .page import read_page, write_page
 from .pieces import to_pieces
 from .placement import place_asset
 from .ply import write_ply
+from .slice_formats import SLICE_FORMATS
 from .slices import write_slice
+from .sog import read_sog
 from .splat_files import read_any_ply, read_splat, read_spz
 from .usd_apart import load_usd_apart
 from .usd_read import load_usd
@@ -36,21 +39,33 @@ READERS: dict[str, Callable[[Path], LoadedAsset]] = {
     ".ply": read_any_ply,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".sog": read_sog,
+    ".4dgs": read_4dgs,
     ".html": read_page,
     **dict.fromkeys(USD_SUFFIXES, _read_usd),
 }
 WRITERS: dict[str, Callable[..., None]] = {
     ".ply": write_ply,
+    ".4dgs": write_4dgs,
     ".html": write_page,
     **dict.fromkeys(USD_SUFFIXES, write_usd),
 }
 READABLE, WRITABLE = tuple(READERS), tuple(WRITERS)
+FRAME_SUFFIXES = tuple(s for s in SLICE_FORMATS if s in READERS)  # of files that may be the frames of a sequence
+STRAIGHT = (".4dgs",)  # formats that know no paths
+APART = (*USD_SUFFIXES, ".sog", ".4dgs")  # by libraries that Blender lacks, so that there the worker reads and writes
+
+
+def named(suffixes: Iterable[str]) -> str:
+    """Suffixes in words, those of USD as one."""
+    kept = dict.fromkeys(".usd*" if s in USD_SUFFIXES else s for s in suffixes)
+    return ", ".join(kept)
 
 
 def read_asset(path: str | Path, *, fps: float = 24.0, frame_start: int = 1) -> LoadedAsset:
-    """Reads a file by its suffix, one of READABLE; or, from a folder, its .ply files as the frames of a sequence (see
-    `read_frames`, also for `fps` and `frame_start`, which count for nothing else). Raises InputError: one sentence that
-    names the file and says what it is and what was expected."""
+    """Reads a file by its suffix, one of READABLE; or, from a folder, its `frame_files` as the frames of a sequence
+    (see `read_frames`, also for `fps` and `frame_start`, which count for nothing else). Raises InputError: one sentence
+    that names the file and says what it is and what was expected."""
     path = Path(path)
     paths = frame_files(path) if path.is_dir() else [path]
     return read_frames(paths, fps=fps, frame_start=frame_start)
@@ -58,17 +73,18 @@ def read_asset(path: str | Path, *, fps: float = 24.0, frame_start: int = 1) -> 
 
 def write_asset(path: str | Path, asset: Asset, *, frame: float | None = None, pieces: bool = False, **options) -> int:
     """Writes the whole asset, to a suffix of WRITABLE, or what is visible at a frame (see `slices.write_slice`); the
-    file appears whole or not at all. `pieces`: straight Gaussians in place of those on paths (see `to_pieces`).
+    file appears whole or not at all. `pieces`: straight Gaussians in place of those on paths (see `to_pieces`), which
+    .4dgs needs in any case.
     `options` are those of the format's writer: `write_usd` has some. Returns the number of Gaussians written. Raises
     InputError."""
-    if pieces:
+    if pieces or Path(path).suffix.lower() in STRAIGHT:
         check(asset, path)
         asset = to_pieces(asset)
     if frame is not None:
         return write_slice(path, asset, frame, **options)
     writer = WRITERS.get(Path(path).suffix.lower())
     if writer is None:
-        raise InputError(f"{path}: cannot write that; choose {', '.join(WRITABLE)}.")
+        raise InputError(f"{path}: cannot write that; choose {named(WRITABLE)}.")
     writer(path, asset, **options)
     return len(asset)
 
@@ -139,21 +155,24 @@ def read_frames(paths: Iterable[str | Path], *, fps: float = 24.0, frame_start: 
 
 
 def frame_files(folder: str | Path) -> list[Path]:
-    """The .ply files right in a folder, in natural order. Raises InputError if there is none."""
+    """The files right in a folder that have the first of FRAME_SUFFIXES that any has, in natural order. Raises
+    InputError if there is none."""
     folder = Path(folder)
     try:
-        found = [p for p in folder.iterdir() if p.suffix.lower() == ".ply" and not p.name.startswith(".")]
+        there = [p for p in folder.iterdir() if not p.name.startswith(".")]
     except OSError as e:
         raise InputError(f"{folder}: it cannot be read ({e.strerror or e}); check the folder.") from None
-    if not found:
-        raise InputError(f"{folder}: there is no .ply file in this folder; choose one with a .ply a frame.")
-    return sorted(found, key=_natural_order)
+    for suffix in FRAME_SUFFIXES:
+        if found := [p for p in there if p.suffix.lower() == suffix]:
+            return sorted(found, key=_natural_order)
+    kinds = named(FRAME_SUFFIXES)
+    raise InputError(f"{folder}: there is no {kinds} in this folder; choose one with a file a frame.")
 
 
 def _read_file(path: Path) -> LoadedAsset:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path}: its name must end in {', '.join(READABLE)}; choose one of these.")
+        raise InputError(f"{path}: its name must end in {named(READABLE)}; choose one of these.")
     if path.is_dir():
         raise InputError(f"{path}: it is a folder; choose a {path.suffix} file.")
     try:

@@ -64,14 +64,14 @@ def read_page(path: Path) -> LoadedAsset:
 def _about(asset: Asset) -> dict:
     """What the player is told beside the .ply; lengths are in normalised space."""
     clip = asset.clip
-    target, radius = _bounds(asset)
+    target, radius = bounds(asset)
     return {
         **{"fps": clip.fps, "start": clip.frame_start, "end": clip.frame_end, "pixel": clip.pixel, "cut": VISIBLE},
         **{"fov": FOV, "target": target, "distance": MARGIN * radius / np.sin(np.radians(FOV / 2))},
     }
 
 
-def _bounds(asset: Asset) -> tuple[list[float], float]:
+def bounds(asset: Asset) -> tuple[list[float], float]:
     """Middle and radius of a ball that shows the asset through the whole clip; strays do not count."""
     clip, places = asset.clip, []
     for frame in np.linspace(clip.frame_start, clip.frame_end, MOMENTS):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The files that one moment of an asset can be written as, by suffix. numpy and the standard library only, for inside
-Blender.
+Blender, but for .sog (sog.py).
 
 Sources: github.com/nianticlabs/spz (README.md), github.com/antimatter15/splat (convert.py),
 github.com/KhronosGroup/glTF (KHR_gaussian_splatting).
@@ -21,6 +21,7 @@ from ...datagen.sequence import InputError
 from .asset import SH_C0, Asset, linear_from_srgb, xyzw_from_wxyz
 from .placement import rotate_quaternions
 from .ply import columns_3dgs, ply_bytes
+from .sog import sog
 from .splat_files import SPLAT_RECORD
 
 SPZ_COLOUR = 0.15  # of a byte's range for one of a coefficient
@@ -139,4 +140,10 @@ def _y_up(part: Asset) -> Asset:
     return replace(part, xyz=part.xyz * np.diag(turn).astype("f4"), rotation=rotate_quaternions(turn, part.rotation))
 
 
-SLICE_FORMATS: dict[str, Callable[[Asset, float], bytes]] = {".ply": ply, ".splat": splat, ".spz": spz, ".glb": glb}
+SLICE_FORMATS: dict[str, Callable[[Asset, float], bytes]] = {
+    ".ply": ply,
+    ".splat": splat,
+    ".spz": spz,
+    ".sog": sog,
+    ".glb": glb,
+}

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Moments of a 4D asset for tools that know nothing of time: plain 3DGS .ply, .splat, .spz and .glb (slice_formats.py),
-or a folder of .ply. numpy and the standard library only, for inside Blender.
+"""Moments of a 4D asset for tools that know nothing of time: files of slice_formats.py, or a folder with one a frame.
+numpy and the standard library only, for inside Blender.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ...datagen.sequence import InputError
 from .asset import VISIBLE, Asset, check, static_asset
 from .atomic import atomic_write
 from .placement import rotate_quaternions
-from .slice_formats import SLICE_FORMATS, ply
+from .slice_formats import SLICE_FORMATS
 
 MINUS_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)  # (x, y, z) of Z up -> (x, -z, y)
 
@@ -50,9 +50,7 @@ def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIB
     check(asset, path)
     if np.isnan(frame):
         raise InputError(f"{frame}: the frame must be a number; give one.")
-    encode = SLICE_FORMATS.get(path.suffix.lower())
-    if encode is None:
-        raise InputError(f"{path}: the name of a slice must end in {', '.join(SLICE_FORMATS)}; choose one of these.")
+    encode = _encoder(path, path.suffix.lower())
     try:
         part = slice_at(asset, frame, cut)
         data = encode(part, frame)
@@ -63,17 +61,26 @@ def write_slice(path: str | Path, asset: Asset, frame: float, cut: float = VISIB
     return len(part)
 
 
-def write_slices(folder: str | Path, asset: Asset, stem: str) -> int:
+def _encoder(path: Path, suffix: str):
+    if suffix not in SLICE_FORMATS:
+        raise InputError(f"{path}: the name of a slice must end in {', '.join(SLICE_FORMATS)}; choose one of these.")
+    return SLICE_FORMATS[suffix]
+
+
+def write_slices(folder: str | Path, asset: Asset, stem: str, suffix: str = ".ply") -> int:
     """`write_moments` of every frame of the clip."""
     check(asset, folder)
-    return write_moments(folder, ((frame, asset) for frame in asset.clip.frames), stem)
+    return write_moments(folder, ((frame, asset) for frame in asset.clip.frames), stem, suffix=suffix)
 
 
-def write_moments(folder: str | Path, moments: Iterable[tuple[int, Asset]], stem: str, cut: float = VISIBLE) -> int:
-    """Writes a 3DGS .ply for each (frame, asset) into a new folder, stem_0001.ply and so on by the frame's
-    number; the folder appears whole or not at all. Returns the number of files. Raises InputError, also if the
-    folder exists and is not empty."""
+def write_moments(
+    folder: str | Path, moments: Iterable[tuple[int, Asset]], stem: str, cut: float = VISIBLE, suffix: str = ".ply"
+) -> int:
+    """Writes a file of a suffix of SLICE_FORMATS for each (frame, asset) into a new folder, stem_0001.ply and so on by
+    the frame's number; the folder appears whole or not at all. Returns the number of files. Raises InputError, also if
+    the folder exists and is not empty."""
     folder, count = Path(folder), 0
+    encode = _encoder(folder / f"{stem}_0001{suffix}", suffix)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -83,7 +90,7 @@ def write_moments(folder: str | Path, moments: Iterable[tuple[int, Asset]], stem
             whole.mkdir()
             for frame, asset in moments:
                 count += 1
-                (whole / f"{stem}_{frame:04d}.ply").write_bytes(ply(slice_at(asset, frame, cut), frame))
+                (whole / f"{stem}_{frame:04d}{suffix}").write_bytes(encode(slice_at(asset, frame, cut), frame))
             if folder.is_dir():
                 folder.rmdir()
             shutil.move(whole, folder)

@@ -4,6 +4,7 @@
 import functools
 import random
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +37,10 @@ def whole() -> dict[str, tuple[str, bytes]]:
         made("lines", ".ply", lines)
         made("paths", ".ply", paths)
         made("page", ".html", lines)
-        for suffix in (".ply", ".splat", ".spz"):
+        for suffix in (".ply", ".splat", ".spz", ".sog"):
             made(f"slice{suffix}", suffix, lines, frame=20.0)
+        if find_spec("fourdgs"):
+            made("4dgs", ".4dgs", lines)
     r = np.random.default_rng(0)
     rows = r.normal(0, 0.3, (4, len(COLUMNS)))
     for form in ("ascii", "binary_big_endian"):

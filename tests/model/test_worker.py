@@ -14,6 +14,7 @@ from timesplat.datagen.sequence import Sequence, View, focal_from_fov, opengl_to
 from timesplat.datagen.sequence import write_sequence as write
 from timesplat.model.io.asset import ARRAYS, Asset, Clip
 from timesplat.model.io.ply import read_ply, write_ply
+from timesplat.model.io.slices import write_slice
 
 
 def ask(*argv, stdin="", code=None):
@@ -77,7 +78,7 @@ def test_lift(tmp_path, sequence):
         ('{"sequence": 3, "asset": "a"}', "sequence must be a text"),
         ('{"sequence": "nowhere", "asset": "a.ply", "method": "lift"}', "nowhere"),
         ('{"colour": 1}', "unknown key colour"),
-        ('{"task": "dance"}', "no task dance; choose one of reconstruct, export, import, selftest"),
+        ('{"task": "dance"}', "no task dance; choose one of reconstruct, export, import, video, selftest"),
         ('{"task": "export", "asset": "a.ply"}', "out is missing"),
         ('{"task": "export", "asset": "a.ply", "out": "a.usdc", "half": 1}', "half must be true or false"),
         ('{"task": "export", "asset": "nowhere.ply", "out": "a.usdc"}', "nowhere.ply"),
@@ -210,9 +211,46 @@ def test_usd_and_back_without_torch(tmp_path):
     assert a.clip == b.clip
     for name in ARRAYS:
         np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=3e-6, err_msg=name)
-    request |= {"source": ply}
+    (tmp_path / "d.usdc").write_bytes((tmp_path / "a.ply").read_bytes())
+    request |= {"source": str(tmp_path / "d.usdc")}
     code, said, _ = ask(stdin=json.dumps(request) + "\n")
-    assert code == 1 and "not a USD file" in said[-1]["message"]
+    assert code == 1 and "d.usdc" in said[-1]["message"]
+
+
+def test_slices_and_films_for_blender(tmp_path):
+    """What Blender lacks libraries for: .sog, folders of them, and films."""
+    pytest.importorskip("PIL")
+    r = np.random.default_rng(0)
+    n = 9
+    one = {"t": np.zeros(n), "sigma_t": np.full(n, 9.0), "opacity": np.full(n, 0.9)}
+    three = {"xyz": r.uniform(-0.5, 0.5, (n, 3)), "velocity": np.zeros((n, 3)), "scale": np.full((n, 3), 0.1)}
+    arrays = {**one, **three, "rgb": r.uniform(0, 1, (n, 3)), "rotation": np.tile([1, 0, 0, 0], (n, 1))}
+    asset = Asset(**{k: v.astype(np.float32) for k, v in arrays.items()}, clip=Clip(24, 3, 4, 2.0, (1, 2, 3)))
+    write_ply(tmp_path / "a.ply", asset)
+    (tmp_path / "frames").mkdir()
+    for frame in (3, 4):
+        write_slice(tmp_path / f"frames/x_{frame:04d}.ply", asset, frame)
+    ply, back = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
+
+    def answer(**request) -> dict:
+        code, said, _ = ask(stdin=json.dumps(request) + "\n")
+        assert code == 0, said
+        return said[-1]
+
+    assert answer(task="export", asset=ply, out=str(tmp_path / "a.sog"), frame=3)["complaints"] == []
+    told = answer(task="import", source=str(tmp_path / "a.sog"), asset=back)
+    assert told["gaussians"] == n and told["up"] == "-Y" and len(read_ply(back)) == n
+    assert answer(task="export", asset=str(tmp_path / "frames"), out=str(tmp_path / "s"), suffix=".sog")["files"] == 2
+    files = sorted((tmp_path / "s").iterdir())
+    assert [f.name for f in files] == ["s_0003.sog", "s_0004.sog"]
+    told = answer(
+        task="import", source=str(files[0]), sources=[str(f) for f in files], asset=back, fps=12, frame_start=3
+    )
+    assert told["gaussians"] == 2 * n and read_ply(back).clip.frames == range(3, 5) and read_ply(back).clip.fps == 12
+    told = answer(task="video", asset=ply, out=str(tmp_path / "t.webp"), size=[32, 24], plays=2)
+    assert told["pictures"] == 4 and (tmp_path / "t.webp").is_file()
+    code, said, _ = ask(stdin=json.dumps({"task": "video", "asset": ply, "out": "t.gif"}) + "\n")
+    assert code == 1 and "films are .mp4 or .webp" in said[-1]["message"]
 
 
 WAITING = """

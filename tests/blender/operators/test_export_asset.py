@@ -74,6 +74,48 @@ def test_the_current_frame_in_other_programs_formats(blender, folder):
     assert (folder / "a.glb").read_bytes()[:4] == b"glTF"
 
 
+def test_what_blender_lacks_libraries_for_is_written_and_read_by_the_worker(blender, folder):
+    """.sog and .4dgs come back where they stood, a folder of .sog as a sequence; without a worker it is a sentence."""
+    pytest.importorskip("fourdgs")
+    code = """
+scene.frame_start, scene.frame_end = 19, 21
+scene.frame_set(20)
+done = [save("a.sog"), save("a.4dgs"), save("frames", format="SLICES", kind="SOG")]
+def world():
+    asset, ob = holding.asset_of(bpy.context.object), bpy.context.object
+    xyz, alpha = asset.at(asset.frame_to_time(20))
+    return (np.c_[xyz, np.ones(len(xyz))] @ np.array(ob.matrix_world).T)[alpha >= 0.05, :3].tolist()
+places = {}
+for name in ("a.sog", "a.4dgs", "frames"):
+    done.append(list(bpy.ops.timesplat.import_asset(filepath=folder + name, frame_start=19)))
+    bpy.context.view_layer.update()
+    places[name] = world()
+bpy.context.view_layer.objects.active = ob
+os.environ["TIMESPLAT_PYTHON"] = "/nowhere/python"
+told = [save("b.sog"), save("b.4dgs")]
+for name in ("a.sog", "a.4dgs"):
+    try:
+        bpy.ops.timesplat.import_asset(filepath=folder + name)
+    except RuntimeError as e:
+        told.append(str(e))
+tell(done=done, places=places, told=told)
+"""
+    told = blender(EXPORT + code, folder, env={"TIMESPLAT_PYTHON": sys.executable})
+    assert told["done"] == [["FINISHED"]] * 6
+    asset = read_ply(folder / "in.ply")
+    xyz, opacity = asset.at(asset.frame_to_time(20))
+    world = xyz * CLIP.scale + np.array(CLIP.translation)
+    for name, got in told["places"].items():
+        found = np.array(got)
+        away = np.abs(world[opacity >= VISIBLE][:, None] - found[None]).max(2).min(1)
+        assert np.percentile(away, 97) < 5e-3, name
+        assert abs(len(found) - (opacity >= VISIBLE).sum()) < 5
+    for said in told["told"]:
+        assert "is read and written by Timesplat's runtime. /nowhere/python: no such file" in said
+    assert sorted(os.listdir(folder)) == ["a.4dgs", "a.sog", "frames", "in.ply"]
+    assert sorted(os.listdir(folder / "frames")) == [f"frames_00{k}.sog" for k in (19, 20, 21)]
+
+
 def test_deleted_gaussians_and_sliders_reach_the_file(blender, folder):
     code = """
 edit.keep_gaussians(ob, np.arange(120) % 3 > 0)
@@ -421,6 +463,36 @@ tell(names=[f("/x/a", "USDZ"), f("/x/a.ply", "USDC"), f("/x/a.v2", "PLY"), f("/x
     assert told["typed"] == ["USDZ", "USDA", "USDA", "SLICE", "PLY"]
     module = "timesplat.addon.operators.export_asset"
     assert module in told["menu"] and module not in told["gone"]
+
+
+def test_blender_and_the_command_line_read_and_write_the_same_formats(blender):
+    """One dispatch: what either knows the other knows, and the menus name it all."""
+    code = """
+importer, exporter = part("addon.operators.import_asset"), part("addon.operators.export_asset")
+said = []
+class Layout:
+    def operator(self, name, text): said.append(text)
+menu = type("Menu", (), {"layout": Layout()})()
+importer._menu(menu, None), exporter._menu(menu, None)
+part("addon").register()
+globs = [bpy.ops.timesplat.import_asset.get_rna_type().properties["filter_glob"].default,
+         bpy.ops.timesplat.export_asset.get_rna_type().properties["filter_glob"].default]
+tell(writes=exporter.SUFFIXES, kinds=[i[1] for i in exporter.KIND_ITEMS], said=said, globs=globs,
+     drops=importer.TIMESPLAT_FH_splats.bl_file_extensions)
+part("addon").unregister()
+"""
+    told = blender(code)
+    whole, slices = set(formats.WRITABLE), set(formats.SLICE_FORMATS)
+    assert set(told["writes"].values()) - {""} == (whole | slices) - {".usd"}, "one of .usdc, .usda and .usdz is chosen"
+    assert set(told["kinds"]) == slices
+    assert set(told["drops"].split(";")) == set(formats.READABLE) == {g[1:] for g in told["globs"][0].split(";")}
+    assert {g[1:] for g in told["globs"][1].split(";")} == whole | slices
+    reads, writes = told["said"]
+    for suffix in formats.READABLE:
+        assert (".usd*" if suffix.startswith(".usd") else suffix) in reads
+    for suffix in whole | slices:
+        assert (".usd*" if suffix.startswith(".usd") else suffix) in writes
+    assert whole <= set(formats.READABLE) and slices - set(formats.READABLE) == {".glb"}, "what is written is read"
 
 
 def test_installed_as_an_extension(installed, folder):

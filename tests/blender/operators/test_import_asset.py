@@ -164,7 +164,7 @@ tell(**result, left=os.listdir(os.environ["TMPDIR"]))
         assert "damaged or not a USD file" in told[f"{key}_bad"]["error"]
         assert "no such file" in told[f"{key}_none"]["error"]
     assert "no such file" in told["python"]["error"] and "one by one" in told["two"]["error"]
-    assert "a.usdz: the USD library gave up on it; it is damaged" in told["crash"]["error"]
+    assert "a.usdz: the library gave up on it; it is damaged" in told["crash"]["error"]
     assert told["full"]["error"] == "/full/x: it cannot be written (No space left on device); make room."
     assert not [n for n in told["left"] if n.startswith("timesplat-")]
 
@@ -193,7 +193,7 @@ tell(errors=result, same=count == (len(bpy.data.objects), len(bpy.data.meshes)))
         "photo.splat": "it is a JPEG picture, not a Gaussian splat .splat",
         "mesh.ply": "it is a polygon mesh",
         "cut.spz": "truncated",
-        "empty": "there is no .ply file",
+        "empty": "there is no .ply, .splat, .spz, .sog in this folder",
         "none.ply": "no such file",
         "a.obj": "must end in",
         "nothing": "No file was chosen",
@@ -220,7 +220,7 @@ def test_menu_and_drop(blender):
     module = "timesplat.addon.operators.import_asset"
     assert module in told["there"] and module not in told["gone"]
     assert (
-        told["suffixes"] == ".ply;.splat;.spz;.html;.usd;.usdc;.usda;.usdz"
+        told["suffixes"] == ".ply;.splat;.spz;.sog;.4dgs;.html;.usd;.usdc;.usda;.usdz"
         and told["target"] == "timesplat.import_asset"
     )
     assert {"filepath", "directory", "files"} <= set(told["operator"]) and not told["handler"]

@@ -98,7 +98,7 @@ def test_slices_come_whole_or_not_at_all(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=r"more.*: it cannot be written \(No space left on device\)"):
             write()
     assert sorted(tmp_path.rglob("*")) == before
-    with pytest.raises(InputError, match=r"must end in \.ply, \.splat, \.spz, \.glb"):
+    with pytest.raises(InputError, match=r"must end in \.ply, \.splat, \.spz, \.sog, \.glb"):
         write_slice(tmp_path / "a.obj", asset, 5)
     with pytest.raises(InputError, match="NaN"):
         write_slice(tmp_path / "a.ply", replace(asset, xyz=asset.xyz * np.float32("nan")), 5)
