@@ -44,11 +44,11 @@ def camera_shots(scene, cameras: list, frames: list[int], norm: Normalisation, i
         scene.frame_set(frame)
         for ob in [cameras[i % len(cameras)]] if in_turn else cameras:
             fov, shift = float(np.degrees(ob.data.angle)), (ob.data.shift_x, ob.data.shift_y)
-            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(_rigid_pose(ob)), fov, shift))
+            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(rigid_pose(ob)), fov, shift))
     return shots
 
 
-def _rigid_pose(ob) -> np.ndarray:
+def rigid_pose(ob) -> np.ndarray:
     """(4,4) float64: where a camera stands, which way it looks and which way is up, without scale, mirroring or shear.
     Raises InputError where its scale leaves no direction."""
     c2w = np.array(ob.matrix_world)

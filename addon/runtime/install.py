@@ -45,6 +45,8 @@ REQUIREMENTS = (
     ("tqdm", "4.66", "tqdm"),
     ("OpenEXR", "3.3", "OpenEXR"),
     ("usd-core", "26.3", "pxr"),
+    ("av", "14", "av"),
+    ("fourdgs", "0.6", "fourdgs"),
 )
 ISOLATED = ("-I", "-X", "utf8")  # Python without what the user has set, that speaks UTF-8 on Windows too
 TORCH_INDEX = {"cpu": "https://download.pytorch.org/whl/cpu", "cuda": "https://download.pytorch.org/whl/cu128"}

@@ -32,6 +32,7 @@ class _Result:
         _draw_sliders(layout.column(align=True), modifier, "")
         row = layout.row(align=True)
         row.operator("timesplat.compare", icon="IMAGE_DATA")
+        row.operator("timesplat.export_video", icon="RENDER_ANIMATION")
         row.operator("timesplat.export_asset", text="Export", icon="EXPORT")
         for title in ("Time", "Crop"):
             header, body = layout.panel(f"timesplat_{title.lower()}", default_closed=True)
@@ -90,6 +91,7 @@ class TIMESPLAT_MT_result(bpy.types.Menu):
         layout = self.layout
         layout.operator_enum("timesplat.show", "what")
         layout.operator("timesplat.compare")
+        layout.operator("timesplat.export_video")
         layout.operator("timesplat.bake")
         layout.separator()
         layout.operator("timesplat.delete_rectangle")
