@@ -8,7 +8,7 @@ MODULES = (
     *("ui.preferences", "settings", "operators.import_asset", "runtime.jobs", "operators.job_operators"),
     *("operators.runtime_buttons", "operators.add_cameras", "runtime.background_blender", "operators.reconstruct"),
     *("command_line", "operators.presets", "ui.panel", "operators.view_colours", "operators.delete", "operators.bake"),
-    *("ui.result_panel", "operators.compare", "operators.export_asset", "operators.export_video"),
+    *("ui.result_panel", "operators.compare", "operators.export_asset", "operators.export_video", "estimates"),
 )
 
 

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from dataclasses import dataclass
 
+from .runtime.folders import user_folder
 from .settings import picture_count
 from .settings import quality as quality_of
 
@@ -27,7 +30,10 @@ QUALITIES = {
 }
 MOST_STEPS = {"guided": 3000, "lift": 3000}  # … and the steps beyond which a method gains nothing
 TRACK_STEPS = (600, 25)  # of tracks: so many, or so many a picture if that is more
-_seconds_a_sample = 2e-7  # seconds a pixel and sample; replaced by what the last capture took
+# What the last Jobs on this machine took, kept between sessions: seconds a pixel and sample of a capture, and how many
+# times longer than by the figures above a reconstruction.
+_learnt = {"seconds_a_sample": 2e-7, "pace": 1.0}
+WILDEST = 20.0  # times that figures of other sessions, or of a Job that the machine slept through, may be off
 
 
 @dataclass
@@ -63,9 +69,9 @@ def estimate(settings, context) -> Estimate:
     if quality != "SECONDS":
         fit = _fit_seconds(settings, n, count)
     fits = 3 if settings.budget == "AUTO" else 1
-    rendering = START_SECONDS + pixels * settings.samples * _seconds_a_sample
+    rendering = START_SECONDS + pixels * settings.samples * _learnt["seconds_a_sample"]
     reconstructing = START_SECONDS + pixels * SECONDS_A_PIXEL[settings.method] + fit * fits
-    return Estimate(n, rendering, reconstructing, round(count))
+    return Estimate(n, rendering, reconstructing * _learnt["pace"], round(count))
 
 
 def _fit_seconds(settings, pictures: int, gaussians: float) -> float:
@@ -78,9 +84,36 @@ def _fit_seconds(settings, pictures: int, gaussians: float) -> float:
 
 
 def learn_speed(seconds: float, pixels: int, samples: int) -> None:
-    """Remembers, for this session, how fast this machine captures."""
-    global _seconds_a_sample
-    _seconds_a_sample = max(seconds - START_SECONDS, 0.1) / max(pixels * samples, 1)
+    """Remembers how fast this machine captures."""
+    _learnt["seconds_a_sample"] = max(seconds - START_SECONDS, 0.1) / max(pixels * samples, 1)
+    _keep()
+
+
+def learn_pace(seconds: float, expected: float) -> None:
+    """Remembers how long a reconstruction took that had been expected to take so long."""
+    if seconds > 0 and expected > 0:
+        pace = _learnt["pace"] * seconds / expected
+        _learnt["pace"] = min(max(pace, 1 / WILDEST), WILDEST)
+        _keep()
+
+
+def _keep() -> None:
+    with contextlib.suppress(OSError):  # it is only an estimate
+        (user_folder("estimates") / "learnt.json").write_text(json.dumps(_learnt))
+
+
+def register() -> None:
+    """Takes up what was learnt in earlier sessions."""
+    try:
+        found = json.loads((user_folder("estimates", create=False) / "learnt.json").read_text())
+        kept = {k: float(found[k]) for k, usual in _learnt.items() if 1 / WILDEST < float(found[k]) / usual < WILDEST}
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    _learnt.update(kept)
+
+
+def unregister() -> None:
+    pass
 
 
 def learn_number(method: str, gaussians: int, pictures: int, size: int) -> None:

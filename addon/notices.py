@@ -31,6 +31,15 @@ def notices(chosen, context, expected: Estimate) -> list[str]:
             said.append(f"{_named(unseen)}: {kinds} has no surface, so that Pictures Only is used.")
         else:
             said.append(f"{_named(unseen)}: {kinds} has no surface to follow; Pictures Only is for that.")
+    strands, grown = survey.hair(objects) if settings.method(chosen, objects) == "tracks" else ([], [])
+    if strands:
+        said.append(f"{_named(strands)}: hair curves are followed, each strand at least a pixel wide: finer fur needs "
+                    "a higher Resolution.")  # fmt: skip
+    if grown:
+        said.append(f"{_named(grown)}: hair of particle systems is led by motion vectors, which is less sharp; as hair "
+                    "curves it is followed.")  # fmt: skip
+    if bright := survey.brighter_than_white(objects):
+        said.append(f"{_named(bright)}: what glows keeps its colour up to white, and lights nothing new afterwards.")
     if chosen.budget == "NUMBER" and (why := _fewer(chosen, expected)):
         said.append(why)
     return said
@@ -56,14 +65,19 @@ def refuse_views_from_outside(chosen, context) -> None:
     if camera is None or settings.cameras(context)[0]:
         return
     objects, graph = set(settings.objects(chosen, context)), context.evaluated_depsgraph_get()
-    place, hits = camera.matrix_world.translation, 0
-    for way in survey.DIRECTIONS:
-        hit, *_, ob, _ = context.scene.ray_cast(graph, place, way)
-        hits += bool(hit and ob.original in objects)
-    if hits >= ENCLOSED * len(survey.DIRECTIONS):
+
+    def enclosed(place) -> bool:
+        hits = 0
+        for way in survey.DIRECTIONS:
+            hit, *_, ob, _ = context.scene.ray_cast(graph, place, way)
+            hits += bool(hit and ob.original in objects)
+        return hits >= ENCLOSED * len(survey.DIRECTIONS)
+
+    if enclosed(camera.matrix_world.translation):
+        others = [o for o in context.scene.objects if o.type == "CAMERA" and enclosed(o.matrix_world.translation)]
         raise InputError(
-            f"{camera.name}: it stands inside of what is captured, and the default cameras stand outside; select the "
-            "cameras to take pictures with, or hide the walls from renders."
+            f"{camera.name}: it stands inside of what is captured, and the default cameras stand outside; select those "
+            f"that stand inside too ({_named(others)}), the more the better, or hide the walls from renders."
         )
 
 

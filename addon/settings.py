@@ -197,6 +197,19 @@ def captured_shapes(context) -> list:
     return [o for o in found if not o.get("timesplat") and o.type not in ("LIGHT", "CAMERA")]
 
 
+def part_is_selected(context) -> bool:
+    """Whether of what would be captured some is selected, with its children, and some is not: what was clicked on last
+    is what is meant. Of large scenes only what is selected itself is looked at."""
+    scene, selected = context.scene, [o for o in context.selected_objects if o.type in CAPTURED_TYPES]
+    selected = [o for o in selected if not o.get("timesplat") and not o.hide_render]
+    if not selected or len(scene.objects) > survey.MOST_SURVEYED:
+        return bool(selected)
+    around = set(survey.surroundings(shapes := captured_shapes(context)))
+    shapes = {o for o in shapes if o.type in CAPTURED_TYPES} - around
+    family = {o for s in selected for o in (s, *s.children_recursive)} & shapes
+    return bool(family) and family != shapes
+
+
 def method(settings, objects: list) -> str:
     """The method that is used: Pictures Only in place of those that follow surfaces, where there hardly is one."""
     return "deform" if survey.mostly_without_surface(objects) else settings.method

@@ -20,6 +20,7 @@ FEW_FACES = 2000  # of a dome or backdrop
 FREE = 1.5  # half-sizes of all else that lie between it and a dome or backdrop
 WALL = 3  # level and upward directions at least in which a dome or backdrop is seen: more than in which a table is
 DIRECTIONS = [Vector(d).normalized() for d in product((-1, 0, 1), repeat=3) if any(d)]
+WHITE = 1.05  # radiance from which on an 8-bit picture shows nothing but white
 MOVING = {"ARMATURE", "CLOTH", "SOFT_BODY", "HOOK", "LATTICE", "MESH_DEFORM", "SURFACE_DEFORM", "CURVE", "NODES"}
 TIMED = {"CLOTH", "SOFT_BODY", "FLUID", "OCEAN", "WAVE", "BUILD", "EXPLODE", "MESH_SEQUENCE_CACHE", "DYNAMIC_PAINT",
          "PARTICLE_SYSTEM"}  # fmt: skip
@@ -129,6 +130,41 @@ def _is_clear(node) -> bool:
         weight = node.inputs["Transmission Weight"]
         return not weight.is_linked and weight.default_value > 0.5
     return node.type in ("BSDF_GLASS", "BSDF_REFRACTION")
+
+
+# ---------------------------------------------------------------- hair, and what glows
+
+
+def hair(objects: list) -> tuple[list, list]:
+    """The objects that are hair curves, and those with hair of particle systems that renders show."""
+    if len(objects) > MOST_SURVEYED:
+        return [], []
+    systems = {ob: [m.particle_system for m in ob.modifiers if m.type == "PARTICLE_SYSTEM" and m.show_render]
+               for ob in objects}  # fmt: skip
+    grown = [ob for ob, found in systems.items() if any(s and s.settings.type == "HAIR" for s in found)]
+    return [ob for ob in objects if ob.type == "CURVES"], grown
+
+
+def brighter_than_white(objects: list) -> list:
+    """The objects with a material that glows brighter than a picture can show."""
+    if len(objects) > MOST_SURVEYED:
+        return []
+    return [ob for ob in objects if any(slot.material and _outshines(slot.material) for slot in ob.material_slots)]
+
+
+def _outshines(material) -> bool:
+    for node in material.node_tree.nodes if material.use_nodes and material.node_tree else ():
+        if node.type == "EMISSION":
+            colour, strength = node.inputs["Color"], node.inputs["Strength"]
+            used = node.outputs[0].is_linked
+        elif node.type == "BSDF_PRINCIPLED":
+            colour, strength = node.inputs["Emission Color"], node.inputs["Emission Strength"]
+            used = node.outputs[0].is_linked
+        else:
+            continue
+        if used and (1.0 if colour.is_linked else max(colour.default_value[:3])) * strength.default_value > WHITE:
+            return True
+    return False
 
 
 # ---------------------------------------------------------------- where the animation ends

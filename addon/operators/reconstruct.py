@@ -119,6 +119,7 @@ def start(chosen, context) -> jobs.Job:
 
     def finish(event: dict, folder: Path) -> str:
         asset = read_ply(folder / "asset.ply")
+        estimates.learn_pace(event.get("seconds", 0.0), expected.reconstructing)
         method = event.get("method", asked["method"])
         fitted = asked["quality"] or (
             asked["refine"] and method not in ("tracks", "deform")
@@ -140,10 +141,8 @@ def start(chosen, context) -> jobs.Job:
                 return f"{said}, but {e}{note}"
         return f"{said}.{note}" if note else said
 
-    shares = [expected.rendering, expected.reconstructing]
-    return jobs.start(
-        "Reconstruction", [render, reconstruct], finish, [x / sum(shares) for x in shares], scene=context.scene.name
-    )
+    seconds = [expected.rendering, expected.reconstructing]
+    return jobs.start("Reconstruction", [render, reconstruct], finish, seconds, scene=context.scene.name)
 
 
 @dataclass(frozen=True)

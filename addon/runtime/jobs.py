@@ -30,18 +30,19 @@ def start(
     label: str,
     stages: list[Callable[[Path], child_process.Child]],
     finish=None,
-    shares=None,
+    expected: list[float] | None = None,
     scene: str | None = None,
     partly: str = "",
 ) -> Job:
     """Starts a Job: `stages` run one after another, each is called with the Job's folder and starts a process;
-    `shares` are their parts of the progress (default: equal ones). `finish(event, folder)` gets the last stage's
-    "done" event and returns the message to show; where `scene` is named it brings something into this scene, and
-    is called when that can be done. `partly`: what stands before the message where the first stage has done its part
-    for good and a later one fails or is cancelled. Raises InputError where the first cannot be started."""
+    `expected` are the seconds that each will take, roughly (default: not known, and equal parts of the progress).
+    `finish(event, folder)` gets the last stage's "done" event and returns the message to show; where `scene` is named
+    it brings something into this scene, and is called when that can be done. `partly`: what stands before the message
+    where the first stage has done its part for good and a later one fails or is cancelled. Raises InputError where the
+    first cannot be started."""
     sweep()
     try:
-        job = Job(label, stages, finish, shares, scene, partly, _file_number)
+        job = Job(label, stages, finish, expected, scene, partly, _file_number)
     except OSError as e:
         raise InputError(f"{user_folder('runs')}: it cannot be written ({e.strerror or e}); make room there.") from None
     ended = [j for j in JOBS if not j.active]

@@ -11,13 +11,19 @@ LONGEST = 40  # characters of a line
 STATE_ICONS = {"waiting": "IMPORT", "done": "CHECKMARK", "failed": "ERROR", "cancelled": "CANCEL"}
 
 
+def in_words(seconds: float) -> str:
+    """Roughly how long, as people say it."""
+    return f"about {max(round(seconds, -1), 10):.0f} s" if seconds < 90 else f"about {seconds / 60:.0f} min"
+
+
 def draw_jobs(layout) -> None:
     """One row a Job, the newest first."""
     for job in reversed(jobs.JOBS):
         box = layout.column(align=True)
         row = box.row(align=True)
         if job.state == "running":
-            row.progress(factor=job.fraction, text=job.text)
+            left = job.seconds_left
+            row.progress(factor=job.fraction, text=job.text if left is None else f"{job.text}, {in_words(left)} left")
         else:
             long = len(job.message) > LONGEST
             text = job.message if job.state == "done" and not long else f"{job.label}: {job.message or job.text}"

@@ -62,9 +62,13 @@ class TIMESPLAT_PT_panel(_Sidebar, bpy.types.Panel):
             row = layout.row(align=True)
             row.label(text="No runtime yet", icon="ERROR")
             row.operator("preferences.addon_show", text="Set Up", icon="PREFERENCES").module = ADDON
-        row = layout.row()
+        row = layout.row(align=True)
         row.scale_y = 1.5
-        _reconstruct_button(row, chosen)
+        if chosen.source == "SCENE" and settings.part_is_selected(context):
+            _reconstruct_button(row, chosen, "Reconstruct Selected", "SELECTED")
+            _reconstruct_button(row, chosen, "All")
+        else:
+            _reconstruct_button(row, chosen)
         job_rows.draw_jobs(layout)
         layout.operator("timesplat.import_asset", icon="IMPORT")
 
@@ -158,11 +162,12 @@ class TIMESPLAT_MT_object(bpy.types.Menu):
         layout.operator("timesplat.self_test")
 
 
-def _reconstruct_button(layout, chosen) -> None:
-    """The button, with the scene's settings."""
-    operator = layout.operator("timesplat.reconstruct", icon="OUTLINER_DATA_POINTCLOUD")
+def _reconstruct_button(layout, chosen, text: str = "Reconstruct", source: str = "") -> None:
+    """The button, with the scene's settings, but for the source where one is given."""
+    operator = layout.operator("timesplat.reconstruct", text=text, icon="OUTLINER_DATA_POINTCLOUD")
     for key in settings.KEYS:
         setattr(operator, key, getattr(chosen, key))
+    operator.source = source or chosen.source
 
 
 _last_notices: tuple = (0.0, None, ([], "INFO"))  # when, of what, and what was said

@@ -167,6 +167,109 @@ def test_what_has_no_surface_goes_by_pictures_alone(blender):
     assert told["enough"] == [] and told["followed"] == 40_000
 
 
+HAIR = """
+curves = bpy.data.hair_curves.new("Fur")
+fur = bpy.data.objects.new("Fur", curves)
+scene.collection.objects.link(fur)
+told = {"curves": said()}
+bpy.data.objects.remove(fur)
+bpy.context.view_layer.objects.active = hero
+bpy.ops.object.particle_system_add()
+hero.particle_systems[0].settings.type = "HAIR"
+told["particles"] = said()
+hero.modifiers[0].show_render = False
+told["hidden"] = said()
+hero.modifiers[0].show_render = True
+chosen.method = "deform"
+told["pictures"] = said()
+chosen.method = "tracks"
+hero.modifiers.clear()
+lamp = bpy.data.materials.new("lamp")
+lamp.use_nodes = True
+tree = lamp.node_tree
+surface = next(n for n in tree.nodes if n.type == "BSDF_PRINCIPLED")
+hero.data.materials.append(lamp)
+told["dark"] = said()
+surface.inputs["Emission Color"].default_value = (1, 0.5, 0, 1)
+surface.inputs["Emission Strength"].default_value = 1.0
+told["dim"] = said()
+surface.inputs["Emission Strength"].default_value = 5.0
+told["bright"] = said()
+surface.inputs["Emission Color"].default_value = (0, 0, 0, 1)
+told["black"] = said()
+glow = tree.nodes.new("ShaderNodeEmission")
+glow.inputs["Strength"].default_value = 9.0
+told["loose"] = said()
+tree.links.new(glow.outputs[0], next(n for n in tree.nodes if n.type == "OUTPUT_MATERIAL").inputs["Surface"])
+told["node"] = said()
+tell(**told)
+"""
+
+
+def test_how_hair_and_what_glows_are_captured_is_said(blender):
+    told = blender(SCENE + HAIR)
+    assert told["curves"] == [
+        "Fur: hair curves are followed, each strand at least a pixel wide: finer fur needs a higher Resolution."
+    ]
+    assert told["particles"] == [
+        "Hero: hair of particle systems is led by motion vectors, which is less sharp; as hair curves it is followed."
+    ]
+    assert told["hidden"] == told["pictures"] == told["dark"] == told["dim"] == told["black"] == told["loose"] == []
+    glows = ["Hero: what glows keeps its colour up to white, and lights nothing new afterwards."]
+    assert told["bright"] == told["node"] == glows
+
+
+SELECTED = """
+def part():
+    bpy.context.view_layer.update()
+    return settings.part_is_selected(bpy.context)
+hero.select_set(True)
+told = {"alone": part()}
+bpy.ops.mesh.primitive_plane_add(size=40)
+ground = named("Ground")
+bpy.ops.object.select_all(action="DESELECT")
+hero.select_set(True)
+told["surroundings"] = part()  # the ground is not captured: she is all that is
+bpy.ops.mesh.primitive_cube_add(location=(3, 0, 0))
+cube = named("Cube")
+told["one"] = part()
+cube.select_set(False)
+told["none"] = part()
+bpy.ops.object.light_add()
+told["light"] = part()
+bpy.ops.object.select_all(action="DESELECT")
+cube.parent = hero
+hero.select_set(True)
+told["family"] = part()
+panel = __import__("timesplat.addon.ui.panel", fromlist=["x"])
+made = []
+class Layout:
+    def __getattr__(self, name): return lambda *a, **k: Layout()
+    def operator(self, name, text="", **_):
+        made.append([name, text, type("Made", (), {})()])
+        return made[-1][2]
+def drawn():
+    made.clear()
+    panel.TIMESPLAT_PT_panel.draw(type("Panel", (), {"layout": Layout()})(), bpy.context)
+    return [[text, o.source] for name, text, o in made if name == "timesplat.reconstruct"]
+told["whole"] = drawn()
+cube.parent = None
+told["offered"] = drawn()
+chosen.source = "SELECTED"
+told["chosen"] = drawn()
+tell(**told)
+"""
+
+
+def test_what_is_selected_is_offered_first(blender):
+    told = blender(SCENE + SELECTED)
+    assert told["alone"] is told["surroundings"] is told["none"] is told["light"] is told["family"] is False
+    assert told["one"] is True
+    assert told["whole"] == [["Reconstruct", "SCENE"]]
+    assert told["offered"] == [["Reconstruct Selected", "SELECTED"], ["All", "SCENE"]]
+    assert told["chosen"] == [["Reconstruct", "SELECTED"]]
+
+
 ROOM = """
 bpy.ops.mesh.primitive_cube_add(size=9)
 named("Room")
@@ -192,4 +295,4 @@ tell(**told)
 def test_cameras_outside_of_a_room_are_refused(blender):
     told = blender(SCENE + ROOM)
     assert told["chosen"] is None and told["outside"] is None
-    assert "inside of what is captured" in told["inside"] and "select the cameras" in told["inside"]
+    assert "inside of what is captured" in told["inside"] and "stand inside too (Camera)" in told["inside"]
