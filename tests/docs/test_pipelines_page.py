@@ -58,8 +58,11 @@ def page(tmp_path_factory, fox) -> Path:
     folder = tmp_path_factory.mktemp("page")
     write_ply(folder / "fox.ply", fox)
     make_original(folder)
-    commands = [line.split("#")[0].split()[1:] for line in PAGE.splitlines() if re.match(r"timesplat export \w", line)]
-    assert len(commands) == 10
+    for extra in ("fourdgs", "av"):
+        pytest.importorskip(extra)
+    lines = [line.split("#")[0] for line in PAGE.splitlines() if re.match(r"timesplat (export|video) \w", line)]
+    commands = [line.split()[1:] for line in lines if "--camera" not in line]
+    assert [sum(c[0] == name for c in commands) for name in ("export", "video")] == [11, 2]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for command in commands:
