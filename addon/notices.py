@@ -60,9 +60,10 @@ def _fewer(chosen, expected: Estimate) -> str:
 
 def refuse_views_from_outside(chosen, context) -> None:
     """Raises InputError where the scene's camera stands inside of what is captured and no other camera is chosen: those
-    that are taken by default stand outside, and would see walls."""
-    camera = context.scene.camera
-    if camera is None or settings.cameras(context)[0]:
+    that are taken by default stand outside, and would see walls. And where all that are chosen stand inside, in the
+    dark, for Studio Lighting comes from outside."""
+    camera, taken = context.scene.camera, settings.cameras(context)[0]
+    if camera is None and not taken:
         return
     objects, graph = set(settings.objects(chosen, context)), context.evaluated_depsgraph_get()
 
@@ -73,6 +74,13 @@ def refuse_views_from_outside(chosen, context) -> None:
             hits += bool(hit and ob.original in objects)
         return hits >= ENCLOSED * len(survey.DIRECTIONS)
 
+    if taken:
+        if chosen.lighting and all(enclosed(o.matrix_world.translation) for o in taken):
+            raise InputError(
+                f"{_named(taken)}: they stand inside of what is captured, where Studio Lighting, which comes from "
+                "outside, is dark; switch it off and light the room."
+            )
+        return
     if enclosed(camera.matrix_world.translation):
         others = [o for o in context.scene.objects if o.type == "CAMERA" and enclosed(o.matrix_world.translation)]
         raise InputError(

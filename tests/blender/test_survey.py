@@ -284,7 +284,10 @@ def refused():
 eye.select_set(False)
 told = {"inside": refused()}
 eye.select_set(True)
+told["dark"] = refused()
+chosen.lighting = False
 told["chosen"] = refused()
+chosen.lighting = True
 eye.select_set(False)
 eye.location = (20, 0, 0)
 told["outside"] = refused()
@@ -295,4 +298,5 @@ tell(**told)
 def test_cameras_outside_of_a_room_are_refused(blender):
     told = blender(SCENE + ROOM)
     assert told["chosen"] is None and told["outside"] is None
+    assert "Camera: they stand inside" in told["dark"] and "Studio Lighting" in told["dark"]
     assert "inside of what is captured" in told["inside"] and "stand inside too (Camera)" in told["inside"]
