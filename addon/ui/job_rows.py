@@ -22,8 +22,8 @@ def draw_jobs(layout) -> None:
         box = layout.column(align=True)
         row = box.row(align=True)
         if job.state == "running":
-            left = job.seconds_left
-            row.progress(factor=job.fraction, text=job.text if left is None else f"{job.text}, {in_words(left)} left")
+            left = job.seconds_left  # before the text, whose end a narrow sidebar cuts off
+            row.progress(factor=job.fraction, text=job.text if left is None else f"{in_words(left)} left, {job.text}")
         else:
             long = len(job.message) > LONGEST
             text = job.message if job.state == "done" and not long else f"{job.label}: {job.message or job.text}"

@@ -50,6 +50,6 @@ def test_time_left_is_told_anew_when_the_first_picture_was_rendered(blender):
         strict=True,
     ):
         assert left == pytest.approx(seconds) and fraction == pytest.approx(part)
-    assert told["shown"] == ["at work, about 2 min left", "at work, about 4 min left"]
+    assert told["shown"] == ["about 2 min left, at work", "about 4 min left, at work"]
     assert told["end"] is None and told["plain"] == [None, 0.25]
     assert told["words"] == ["about 10 s", "about 10 s", "about 90 s", "about 2 min", "about 7 min"]
