@@ -22,6 +22,7 @@ EPILOG = """the road, step by step:
   timesplat reconstruct data/fox/fox/Run --out fox.ply           one 4D Gaussian asset
   timesplat export fox.ply fox.usdc                              for USD pipelines
   timesplat view fox.ply                                         in the browser
+  timesplat video fox.ply fox.mp4                                a turntable that plays
 all of it at once, with pictures and figures:
   timesplat demo fox.glb
 """

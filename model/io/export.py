@@ -15,6 +15,8 @@ from ...datagen.sequence import InputError
 if TYPE_CHECKING:
     from .asset import Asset, LoadedAsset
 
+FILMS = (".mp4", ".webp", ".gif", ".mov")  # which people may ask for here
+
 
 def add_export_arguments(p: argparse.ArgumentParser) -> None:
     from .files import FRAME_SUFFIXES, WRITABLE, named
@@ -73,6 +75,8 @@ def export(args: argparse.Namespace) -> int:
             save_blend(ply, args.out)
     elif suffix not in WRITABLE and args.frame is None and suffix in SLICE_FORMATS:
         raise InputError(f"{args.out}: {suffix} holds one moment; say which by --frame.")
+    elif suffix in FILMS:
+        raise InputError(f"{args.out}: films are made by `timesplat video`; say that in place of export.")
     elif suffix not in WRITABLE and args.frame is None:
         raise InputError(f"{args.out}: cannot write that; choose {named(WRITABLE)} or .blend.")
     else:

@@ -131,6 +131,7 @@ def test_paths_become_pieces_where_a_format_knows_none(tmp_path, capsys):
         ("a.ply b.ply --suffix .sog", "--suffix is for the files of --sequence"),
         ("a.ply b.ply --frame 3 --pieces", "--pieces is for what has time"),
         ("a.ply b.obj", "b.obj: cannot write that; choose .ply, .4dgs, .html, .usd* or .blend."),
+        ("a.ply b.mp4", "b.mp4: films are made by `timesplat video`"),
         ("a.ply b.sog", "b.sog: .sog holds one moment; say which by --frame."),
         ("a.ply b.4dgs --frame 3", "the name of a slice must end in .ply, .splat, .spz, .sog, .glb"),
         ("b.ply c.ply", "b.ply: no such file"),
