@@ -15,6 +15,7 @@ from .asset.visibility import HIDDEN
 
 RIG_COLLECTION = "Timesplat Cameras"  # the collection that `rigs` puts cameras into
 MOST_AUTOMATIC_FRAMES = 24  # frames that "every: automatic" comes near to
+MANY = 50  # objects, of which it takes milliseconds to find out
 CAPTURED_TYPES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD")
 METHODS = [
     (
@@ -202,7 +203,7 @@ def part_is_selected(context) -> bool:
     is what is meant. Of large scenes only what is selected itself is looked at."""
     scene, selected = context.scene, [o for o in context.selected_objects if o.type in CAPTURED_TYPES]
     selected = [o for o in selected if not o.get("timesplat") and not o.hide_render]
-    if not selected or len(scene.objects) > survey.MOST_SURVEYED:
+    if not selected or len(scene.objects) > MANY:
         return bool(selected)
     around = set(survey.surroundings(shapes := captured_shapes(context)))
     shapes = {o for o in shapes if o.type in CAPTURED_TYPES} - around

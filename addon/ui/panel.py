@@ -15,7 +15,6 @@ from ..runtime import worker_options
 from ..runtime.folders import ADDON
 from . import job_rows
 
-MANY = 50  # objects, of which it takes milliseconds to find out
 FRESH_SECONDS = 2.0
 
 
@@ -178,7 +177,7 @@ def _notices(chosen, context, expected) -> tuple[list[str], str]:
     global _last_notices
     of = context.scene.name, len(context.scene.objects), *(getattr(chosen, key) for key in settings.KEYS)
     when, what, said = _last_notices
-    if len(context.scene.objects) > MANY and what == of and time.monotonic() - when < FRESH_SECONDS:
+    if len(context.scene.objects) > settings.MANY and what == of and time.monotonic() - when < FRESH_SECONDS:
         return said
     try:
         said = notices.notices(chosen, context, expected), "INFO"
