@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from .errors import InputError
+from .whole_folders import write_whole
 
 LICENCES = "licences.csv"  # beside the files; `render --licences` reads it
 _COLUMNS = ("uid", "licence", "author", "title", "url", "sha256")
@@ -153,9 +154,7 @@ def _write_rows(path: Path, rows: dict[str, dict[str, str]]) -> None:
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows[uid] for uid in sorted(rows))
-    tmp = path.with_name(f".{path.name}.tmp")
-    tmp.write_text(text.getvalue(), encoding="utf-8")
-    tmp.replace(path)
+    write_whole(path, text.getvalue().encode())
 
 
 # ---------------------------------------------------------------- the command line

@@ -19,6 +19,7 @@ from pathlib import Path
 from .errors import InputError
 from .licences import Terms
 from .render_job import Asset
+from .whole_folders import write_whole
 
 RENDERED = "rendered"
 FAILURES = REFUSED, CRASHED, TIME, MEMORY = "refused", "crashed", "time", "memory"  # why an asset failed
@@ -78,9 +79,9 @@ def failure_row(
 
 def keep_failure(out: Path, row: Row, conditions: dict) -> None:
     """Writes why an asset failed into its folder. conditions: under which it did (settings, limits)."""
-    folder = out / row.name
-    folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / FAILED, (json.dumps({"conditions": conditions, "row": asdict(row)}, indent=1) + "\n").encode())
+    write_whole(
+        out / row.name / FAILED, (json.dumps({"conditions": conditions, "row": asdict(row)}, indent=1) + "\n").encode()
+    )
 
 
 def kept_failure(out: Path, asset: Asset, sha256: str, conditions: dict) -> Row | None:
@@ -106,7 +107,7 @@ def set_terms(folder: Path, terms: Terms) -> None:
     new = d["provenance"] | {key: text for key, text in terms.as_provenance().items() if text}
     if new != d["provenance"]:
         d["provenance"] = new
-        _write(path, json.dumps(d, indent=1).encode())
+        write_whole(path, json.dumps(d, indent=1).encode())
 
 
 # ---------------------------------------------------------------- the table
@@ -120,18 +121,17 @@ def write_index(out: Path, rows: Iterable[Row]) -> None:
     named = {row.name.lower() for row in rows}
     others = [row for row in read_index(out) if row.name.lower() not in named]
     rows = sorted([*rows, *(row for row in others if (out / row.sequence).is_dir())])
-    out.mkdir(parents=True, exist_ok=True)
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [f.name for f in fields(Row)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
-    _write(out / CSV, text.getvalue().encode("utf-8", "surrogateescape"))
+    write_whole(out / CSV, text.getvalue().encode("utf-8", "surrogateescape"))
     types = {"int": pyarrow.int64(), "float": pyarrow.float64()}
     schema = pyarrow.schema([(f.name, types.get(str(f.type), pyarrow.string())) for f in fields(Row)])
     whole = [{k: _sayable(v) for k, v in asdict(row).items()} for row in rows]
     sink = io.BytesIO()
     parquet.write_table(pyarrow.Table.from_pylist(whole, schema), sink, compression="zstd")
-    _write(out / PARQUET, sink.getvalue())
+    write_whole(out / PARQUET, sink.getvalue())
 
 
 def read_index(out: Path) -> list[Row]:
@@ -166,10 +166,3 @@ def needed():
             "render: pyarrow is missing, which writes the table; pip install 'timesplat[render]'."
         ) from None
     return pyarrow, pyarrow.parquet
-
-
-def _write(path: Path, data: bytes) -> None:
-    """A file, whole or as it was."""
-    tmp = path.with_name(f".{path.name}.tmp")  # the same one, so that a killed run leaves none for good
-    tmp.write_bytes(data)
-    tmp.replace(path)

@@ -34,6 +34,7 @@ from .passes import Passes, read_passes
 from .readers import described_by, open_sequence, sequences_in
 from .rigs import CANONICAL
 from .sequence import Sequence, distinct, sequence_from_json, sequence_to_json
+from .whole_folders import write_whole
 
 MANIFEST = "manifest.csv"
 FORMATS = WEBP, PNG = "webp", "png"
@@ -224,9 +225,7 @@ def write_manifest(path: Path, clips: Iterable[Clip]) -> None:
     writer = csv.DictWriter(text, [f.name for f in fields(Clip)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(asdict(c) for c in clips)
-    tmp = path.with_name(f".{path.name}.tmp")
-    tmp.write_text(text.getvalue(), encoding="utf-8", errors="surrogateescape")
-    tmp.replace(path)
+    write_whole(path, text.getvalue().encode("utf-8", "surrogateescape"))
 
 
 # ---------------------------------------------------------------- reading

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Folders that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -25,6 +25,15 @@ def move(source: str | Path, target: str | Path) -> None:
             return os.replace(source, target)
         time.sleep(pause)
     os.replace(source, target)
+
+
+def write_whole(path: Path, data: bytes) -> Path:
+    """Writes a file whole or leaves it as it was, and makes its folder; returns the path. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tmp = path.with_name(f".{path.name}.tmp")  # always the same one, so that a run that was killed leaves none for good
+    tmp.write_bytes(data)
+    move(tmp, path)
+    return path
 
 
 @contextlib.contextmanager

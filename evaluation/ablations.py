@@ -25,10 +25,11 @@ import numpy as np
 
 from ..datagen.readers import open_sequence, sequences_in
 from ..datagen.sequence import InputError, Sequence
+from ..datagen.whole_folders import write_whole
 from ..exit_codes import exit_code
 from . import protocol, runner
 from .cache import Cache, name_sequences
-from .figures import command_line, write_table, write_whole
+from .figures import command_line, write_table
 from .method_spec import parse_spec
 from .metrics import METRICS
 from .provenance import Provenance

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..datagen.sequence import InputError
-from .figures import write_whole
+from ..datagen.whole_folders import write_whole
 from .method_spec import MethodSpec, parse_spec
 from .metrics import METRICS
 from .scoring import COSTS

@@ -20,8 +20,9 @@ import numpy as np
 from ..benchmarks.renderer import COLUMNS as RENDERER
 from ..benchmarks.renderer import TRUTH
 from ..datagen.sequence import InputError
+from ..datagen.whole_folders import write_whole
 from .bench_summary import FIGURES, Mean, frontier, read_csv, summarise
-from .figures import COLOURS, MARKERS, panels, save, write_whole
+from .figures import COLOURS, MARKERS, panels, save
 from .labels import plain, settle
 from .metrics import METRICS
 

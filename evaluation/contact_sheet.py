@@ -17,9 +17,9 @@ import torch
 
 from ..datagen.readers import open_sequence
 from ..datagen.sequence import Sequence
+from ..datagen.whole_folders import write_whole
 from ..exit_codes import exit_code
 from ..model.views import load_views
-from .figures import write_whole
 from .pictures import grid
 
 

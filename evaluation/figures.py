@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..datagen.whole_folders import write_whole
 from .provenance import Provenance
 
 # Okabe and Ito's colours, which colour-blind people tell apart; the markers tell them apart in print.
@@ -26,15 +27,6 @@ def command_line(module: str, argv: Sequence[str] | None = None) -> str:
     import shlex
 
     return shlex.join(["python", "-m", module, *(sys.argv[1:] if argv is None else argv)])
-
-
-def write_whole(path: Path, data: bytes) -> Path:
-    """Writes a file whole or not at all, and makes its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tmp = path.with_name(f".{path.name}.tmp")
-    tmp.write_bytes(data)
-    tmp.replace(path)
-    return path
 
 
 # ---------------------------------------------------------------- tables

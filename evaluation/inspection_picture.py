@@ -12,7 +12,8 @@ import numpy as np
 from ..datagen.inspection import up_axis
 from ..datagen.readers.placing import HELD_OUT
 from ..datagen.sequence import Sequence
-from .figures import COLOURS, write_whole
+from ..datagen.whole_folders import write_whole
+from .figures import COLOURS
 
 SHOWN = 24  # pictures of the contact sheet
 COLUMNS = 8

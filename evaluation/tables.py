@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..datagen.whole_folders import write_whole
 from . import paper, protocol
-from .figures import write_whole
 from .lpips import HINT
 from .metrics import ALL, METRICS, NOVEL, summarise
 from .metrics import COLUMNS as METRIC_COLUMNS

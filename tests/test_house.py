@@ -68,9 +68,9 @@ LAYERS = {
         ("addon",),
     ),
     "datagen": (
-        ("datagen.errors", "datagen.image_files", "datagen.rigs", "datagen.track_file", "datagen.objaverse"),
+        ("datagen.errors", "datagen.image_files", "datagen.rigs", "datagen.track_file"),
         ("datagen.whole_folders",),
-        ("datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
+        ("datagen.objaverse", "datagen.outside", "datagen.spread", "datagen.moving_frames", "datagen.passes"),
         ("datagen.sequence",),
         ("datagen.readers",),
         ("datagen.curation.measures",),

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 from ..errors import InputError
+from ..whole_folders import write_whole
 from .measures import Measures
 
 SETS = ("hq4d", "4d", "3d")
@@ -121,9 +122,7 @@ def write_decisions(path: Path, decisions: Iterable[Decision]) -> None:
     writer.writeheader()
     for d in sorted(decisions, key=lambda d: d.sequence):
         writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in asdict(d).items()})
-    tmp = path.with_name(f".{path.name}.tmp")
-    tmp.write_text(text.getvalue(), encoding="utf-8", errors="surrogateescape")
-    tmp.replace(path)
+    write_whole(path, text.getvalue().encode("utf-8", "surrogateescape"))
 
 
 def read_decisions(path: Path) -> list[Decision]:

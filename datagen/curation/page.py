@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import InputError
 from ..rigs import CANONICAL
 from ..sequence import read_sequence
+from ..whole_folders import write_whole
 from .decisions import OUT, SETS, Bounds, Decision
 from .measures import over_white
 
@@ -47,9 +48,7 @@ def write_report(path: Path, folder: Path, decisions: List[Decision], bounds: Bo
         parts.append(f"<h2>{_TITLES[name]} ({len(groups[name])})</h2>")
         parts.append(_grid(folder, sorted(groups[name], key=lambda d: (_known(d.motion), d.sequence))))
     text = f"<!doctype html><meta charset=utf-8><title>Curation of {_text(folder.name)}</title><style>{_STYLE}</style>"
-    tmp = path.with_name(f".{path.name}.tmp")
-    tmp.write_text(text + "\n".join(parts), encoding="utf-8", errors="backslashreplace")
-    tmp.replace(path)
+    write_whole(path, (text + "\n".join(parts)).encode("utf-8", "backslashreplace"))
 
 
 def advice(decisions: List[Decision], bounds: Bounds) -> str:

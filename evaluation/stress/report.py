@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..figures import COLOURS, MARKERS, panels, save, write_whole
+from ...datagen.whole_folders import write_whole
+from ..figures import COLOURS, MARKERS, panels, save
 from ..provenance import Provenance
 from .cells import Figures, number
 from .measures import MEASURES, lost
