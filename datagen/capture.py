@@ -9,6 +9,7 @@ gives picture, depth and motion vectors at once.
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 import tempfile
@@ -83,7 +84,7 @@ def capture(
     settings: CaptureSettings | None = None,
     *,
     provenance: dict | None = None,
-    started: float | None = None,
+    started: tuple[float, float] | None = None,
     refuse_empty: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Sequence:
@@ -91,7 +92,8 @@ def capture(
 
     shots           cameras in normalised space; `Shot.frame` counts the clip's frames, 0…len(subject.frames)-1
     provenance      what the Sequence says of where it came from
-    started         when work on it began, by time.monotonic(): the provenance says how many seconds ago; None = now
+    started         when work on it began, as `clocks` had it: the provenance says how many seconds ago by the clock,
+                    and how many of the processor's were spent since; None = now
     refuse_empty    pictures of which none shows anything are an InputError that names this
     progress        called with (images done, images in all) after every frame
 
@@ -101,7 +103,7 @@ def capture(
     Values that an artist changed without keying them are lost, as after every animation render in Blender; everything
     else is as before.
     """
-    settings, started = settings or CaptureSettings(), time.monotonic() if started is None else started
+    settings, started = settings or CaptureSettings(), started or clocks()
     if not shots:
         raise InputError(f"{out}: there is no camera to render; choose a rig and at least one frame.")
     names = _file_names(shots)
@@ -136,9 +138,15 @@ def capture(
                     f"{refuse_empty}: no picture shows anything, for what is there is transparent or out of sight; "
                     "look at its materials and visibility."
                 )
-        seq.provenance["seconds"] = round(time.monotonic() - started, 2)
+        spent = [round(now - then, 2) for now, then in zip(clocks(), started, strict=True)]
+        seq.provenance["seconds"], seq.provenance["cpu_seconds"] = spent
 
     return write_sequence(seq, out, fill)
+
+
+def clocks() -> tuple[float, float]:
+    """Seconds by the clock, since some moment, and of the processor, of this process and of children that ended."""
+    return time.monotonic(), sum(os.times()[:4])
 
 
 def _file_names(shots: list[Shot]) -> dict[tuple[str, str], str]:

@@ -9,23 +9,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import re
-import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from queue import SimpleQueue
 
 from .. import __version__
 from . import ASSET_SUFFIXES
 from .licences import Licences, Terms, read_licences
 from .render_child import Limits, remove_half_written, run_child
 from .render_index import (
-    CRASHED,
     CSV,
     REFUSED,
     Row,
@@ -39,6 +33,7 @@ from .render_index import (
     write_index,
 )
 from .render_job import ALL_CLIPS, CLIPS, Asset, RenderSettings, file_sha256, list_assets, rendered_sequences
+from .render_pool import LocalPool, cores
 from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
 
@@ -75,15 +70,15 @@ def render_assets(
     done, images = len(listed) - len(pending), 0
     progress(done, len(listed), images)
     try:
-        with _Farm(run, max(1, min(jobs, len(pending)))) as farm:
-            for message in farm.render(pending):
+        with LocalPool(max(1, min(jobs, len(pending))), run.limits) as pool:
+            for message in pool.render([run.job(task) for task in pending]):
                 if "warning" in message:
                     report(message["warning"])
                 elif "image" in message:
                     images += message["image"]
                 elif "end" in message:
                     done += 1
-                    if sentence := run.finish(**message["end"]):
+                    if sentence := run.finish(pending[message.pop("end")], **message):
                         report(sentence)
                 progress(done, len(listed), images)
     finally:
@@ -125,25 +120,23 @@ class _Run:
                 pending.append(task)
         return pending
 
-    def finish(self, task: _Task, written: list[str], error: dict | None, seconds: float) -> str | None:
-        """Notes what became of an asset; the sentence if it failed."""
+    def finish(self, task: _Task, written: list[str], error: dict | None, **seconds: float) -> str | None:
+        """Notes what became of an asset, as `render_job` tells it; the sentence if it failed."""
         self._note_sequences(task, [Path(folder) for folder in written])
         # Blender may crash on its way out, after all is written: the next run would find it finished
         if not error or rendered_sequences(self.out / task.asset.name, task.asset, self.settings)[1]:
             forget_failure(self.out, task.asset)
             return None
-        row = failure_row(
-            task.asset, error["error"], error["status"], sha256=task.sha256, terms=task.terms, seconds=seconds
-        )
+        row = failure_row(task.asset, error["error"], error["status"], sha256=task.sha256, terms=task.terms, **seconds)
         with contextlib.suppress(OSError):  # the disk is full, or a file has that folder's name: the table has it still
             keep_failure(self.out, row, self._conditions())
         self._note_failure(row)
         return row.sentence
 
-    def job(self, task: _Task, own_cores: list[int]) -> dict:
-        """As `render_asset` takes it."""
+    def job(self, task: _Task) -> dict:
+        """As `render_asset` takes it, but for the cores."""
         job = {"asset": asdict(task.asset), "settings": asdict(self.settings), "terms": task.terms.as_provenance()}
-        return job | {"out": str(self.out / task.asset.name), "cores": own_cores}
+        return job | {"out": str(self.out / task.asset.name)}
 
     def _conditions(self) -> dict:
         return {"settings": asdict(self.settings), "limits": asdict(self.limits), "timesplat": __version__}
@@ -166,61 +159,6 @@ class _Task:
     asset: Asset
     sha256: str
     terms: Terms
-
-
-class _Farm:
-    """Child processes, so many at a time. As a context: an exception inside kills those that run."""
-
-    def __init__(self, run: _Run, jobs: int) -> None:
-        self.run = run
-        self.pool = ThreadPoolExecutor(jobs)
-        self.running: set[subprocess.Popen] = set()
-        self.messages: SimpleQueue[dict] = SimpleQueue()
-        self.free_cores: SimpleQueue[list[int]] = SimpleQueue()
-        for i in range(jobs):  # one core each: twice as efficient as threads that wait for each other
-            self.free_cores.put([cores()[i % len(cores())]] if jobs > 1 else [])
-
-    def __enter__(self) -> _Farm:
-        return self
-
-    def __exit__(self, kind, error, traceback) -> None:
-        if kind:
-            self.pool.shutdown(wait=False, cancel_futures=True)
-            for process in list(self.running):
-                process.kill()
-        self.pool.shutdown()
-
-    def render(self, tasks: list[_Task]) -> Iterator[dict]:
-        """The messages of all children as they come (see `render_asset`), and {"end": …}, the arguments of
-        `_Run.finish`, once for each asset, its last."""
-        for task in tasks:
-            self.pool.submit(self._render_one, task)
-        unfinished = len(tasks)
-        while unfinished:
-            message = self.messages.get()
-            unfinished -= "end" in message
-            yield message
-
-    def _render_one(self, task: _Task) -> None:
-        own_cores, start = self.free_cores.get(), time.monotonic()
-        written, errors = [], []
-
-        def receive(message: dict) -> None:
-            if "written" in message:
-                written.append(message["written"])
-            elif "error" in message:
-                errors.append(message)
-            else:
-                self.messages.put(message)
-
-        try:
-            run_child(self.run.job(task, own_cores), receive, self.running, self.run.limits)
-        except OSError as e:  # no process, no file could be made
-            errors.append({"error": f"{task.asset.path}: it could not be started ({e}); try again.", "status": CRASHED})
-        finally:
-            self.free_cores.put(own_cores)
-            error, seconds = next(iter(errors), None), time.monotonic() - start
-            self.messages.put({"end": {"task": task, "written": written, "error": error, "seconds": seconds}})
 
 
 def render_shots(
@@ -253,13 +191,6 @@ def render_shots(
     if errors:
         raise InputError(errors[0])
     return read_sequence(Path(folder))
-
-
-def cores() -> list[int]:
-    """The processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
 
 
 # ---------------------------------------------------------------- the command line

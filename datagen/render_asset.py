@@ -15,7 +15,6 @@ import os
 import re
 import signal
 import sys
-import time
 import zlib
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -42,7 +41,9 @@ def run_job(job: dict, send: Callable[[dict], None]) -> None:
     "settings" (RenderSettings as a dict), "terms" (entries of the provenance), and "out" (a folder for a folder a clip)
     or "folder" (that of the one clip). Raises InputError."""
     settings, asset = RenderSettings(**job["settings"]), Asset(**job["asset"])
-    start = time.monotonic()
+    from .capture import clocks
+
+    start = (clocks()[0], 0.0)  # the start of Python and of Blender is of the first clip's processor seconds
     opened, provenance = _open(asset)
     provenance |= job["terms"]
     for warning in opened.warnings:
@@ -60,7 +61,7 @@ def run_job(job: dict, send: Callable[[dict], None]) -> None:
                 simulate_scene([c for c in clips if not c.actions], settings)
                 simulated = True
             _render_clip(clip, asset, folder, settings, provenance, start, send)
-            start = time.monotonic()
+            start = clocks()
         send({"written": str(folder)})
 
 
@@ -88,7 +89,7 @@ def _render_clip(
     folder: Path,
     settings: RenderSettings,
     provenance: dict,
-    started: float,
+    started: tuple[float, float],
     send: Callable[[dict], None],
 ) -> None:
     """Renders the clip that the open scene plays into the Sequence `folder`. started: as `capture` takes it."""
@@ -129,7 +130,7 @@ def _capture(
     folder: Path,
     settings: RenderSettings,
     provenance: dict,
-    started: float,
+    started: tuple[float, float],
     send: Callable[[dict], None],
 ) -> None:
     """Renders these frames of the open scene, which is `unit` times as large as the asset `name`."""

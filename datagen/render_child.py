@@ -43,9 +43,10 @@ class Limits:
 
 def run_child(
     job: dict, receive: Callable[[dict], None], running: set[subprocess.Popen], limits: Limits | None = None
-) -> None:
+) -> float:
     """Runs one job (see `render_asset`) in a child process, which is in `running` meanwhile, and passes on its
-    messages; its death is a message too, {"error": …, "status": …}."""
+    messages; its death is a message too, {"error": …, "status": …}. Returns the processor seconds that it took, its
+    own children included; 0 where the system does not tell."""
     with tempfile.TemporaryDirectory(prefix="timesplat-", ignore_cleanup_errors=True) as tmp:
         job_file, log = Path(tmp) / "job.json", Path(tmp) / "log"
         job_file.write_text(json.dumps(job))
@@ -63,7 +64,7 @@ def run_child(
                     continue
                 said_error |= "error" in message
                 receive(message)
-            code = process.wait()
+            code, spent = _wait(process)
         finally:
             ended.set()
             process.kill()
@@ -73,6 +74,42 @@ def run_child(
             remove_half_written(job)
         if code and not said_error:
             receive(_death(job["asset"]["path"], code, log, verdict[0] if verdict else "", limits))
+    return spent
+
+
+def render_job(
+    job: dict, receive: Callable[[dict], None], running: set[subprocess.Popen], limits: Limits | None = None
+) -> dict:
+    """`run_child`, and what became of the job: {"written": folders, "error": the first such message or None, "seconds":
+    by the clock, "cpu_seconds": of the processor}. `receive` gets all other messages. It never raises for a job."""
+    start, spent, written, errors = time.monotonic(), 0.0, [], []
+
+    def sort(message: dict) -> None:
+        if "written" in message:
+            written.append(message["written"])
+        elif "error" in message:
+            errors.append(message)
+        else:
+            receive(message)
+
+    try:
+        spent = run_child(job, sort, running, limits)
+    except OSError as e:  # no process, no file could be made
+        path = job["asset"]["path"]
+        errors.append({"error": f"{path}: it could not be started ({e}); try again.", "status": CRASHED})
+    error, seconds = next(iter(errors), None), time.monotonic() - start
+    return {"written": written, "error": error, "seconds": seconds, "cpu_seconds": spent}
+
+
+def _wait(process: subprocess.Popen) -> tuple[int, float]:
+    """The exit code, negative for a signal, and processor seconds, of a child and of its own; 0 where that is not
+    told."""
+    try:
+        _, status, usage = os.wait4(process.pid, 0)
+    except (AttributeError, ChildProcessError):  # Windows; `_watch` was first to see that it is gone
+        return process.wait(), 0.0
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return process.returncode, usage.ru_utime + usage.ru_stime
 
 
 def _death(path: str, code: int, log: Path, verdict: str, limits: Limits | None) -> dict:

@@ -41,7 +41,9 @@ class Row:
     camera_seed: int = -1
     blender: str = ""
     timesplat: str = ""
+    pictures: int = 0
     seconds: float = 0.0  # by the clock: opening the file (with its first clip), measuring, rendering, writing
+    cpu_seconds: float = 0.0  # of the processor, the start of Blender included; 0 where it was not measured
     status: str = RENDERED  # or one of FAILURES
     sentence: str = ""  # why it failed, or what there is to be said of the Sequence
 
@@ -50,7 +52,8 @@ def sequence_row(out: Path, folder: Path, asset: Asset) -> Row:
     """Of the Sequence in `folder`, which is below the run's folder `out`. Raises InputError."""
     path = folder / "transforms.json"
     try:
-        p = json.loads(path.read_text(encoding="utf-8"))["provenance"]
+        d = json.loads(path.read_text(encoding="utf-8"))
+        p = d["provenance"]
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: it is missing or damaged; render the Sequence again.") from None
     return Row(
@@ -61,16 +64,26 @@ def sequence_row(out: Path, folder: Path, asset: Asset) -> Row:
         camera_seed=int(p.get("cameras_seed", -1)),
         blender=str(p.get("blender", "")),
         timesplat=str(p.get("timesplat", "")),
+        pictures=len(d.get("frames", [])),
         seconds=float(p.get("seconds", 0)),
+        cpu_seconds=float(p.get("cpu_seconds", 0)),
         sentence=" ".join(p.get("warnings", [])),
     )
 
 
 def failure_row(
-    asset: Asset, sentence: str, status: str, *, sha256: str = "", terms: Terms | None = None, seconds: float = 0.0
+    asset: Asset,
+    sentence: str,
+    status: str,
+    *,
+    sha256: str = "",
+    terms: Terms | None = None,
+    seconds: float = 0.0,
+    cpu_seconds: float = 0.0,
 ) -> Row:
     """Of an asset that failed; status: one of FAILURES."""
-    more = {"sha256": sha256, "seconds": round(seconds, 2), "status": status, "sentence": sentence}
+    times = {"seconds": round(seconds, 2), "cpu_seconds": round(cpu_seconds, 2)}
+    more = {"sha256": sha256, **times, "status": status, "sentence": sentence}
     return Row(asset.name, "", asset.below_root, **(terms or Terms()).as_provenance(), **more)
 
 
@@ -148,7 +161,9 @@ def read_index(out: Path) -> list[Row]:
 
 
 def _row(d: dict[str, str]) -> Row:
-    return Row(**d | {"camera_seed": int(d["camera_seed"]), "seconds": float(d["seconds"])})  # type: ignore[arg-type]
+    """Of a line of the table; columns that an earlier version did not write are as where nothing is known."""
+    kinds: dict[str, type] = {"int": int, "float": float, "str": str}
+    return Row(**{f.name: kinds[str(f.type)](d[f.name]) for f in fields(Row) if f.name in d})
 
 
 def _sayable(value):

@@ -300,7 +300,7 @@ def measure_renderer(path: Path, jobs: int) -> None:
     if path.is_file() or not find_spec("bpy"):
         return
     from ..benchmarks import renderer
-    from ..datagen.farm import cores
+    from ..datagen.render_pool import cores
     from . import charts
 
     rows: list[dict] = []

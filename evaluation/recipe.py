@@ -21,8 +21,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from ..benchmarks.recipe import SIZE, TRUTH, WAYS
-from ..datagen.farm import cores
 from ..datagen.render_job import list_assets
+from ..datagen.render_pool import cores
 from ..datagen.sequence import InputError, read_sequence
 from .figures import COLOURS, MARKERS, panels, save, write_table
 from .labels import plain

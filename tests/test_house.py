@@ -81,7 +81,7 @@ LAYERS = {
         ("datagen.displace", "datagen.blender_output", "datagen.scene", "datagen.zoo", "datagen.render_job"),
         ("datagen.licences", "datagen.render_index"),
         ("datagen.render_setup", "datagen.tracks", "datagen.render_child"),
-        ("datagen.capture",),
+        ("datagen.capture", "datagen.render_pool"),
         ("datagen.render_asset", "datagen.render_trials", "datagen.farm"),
     ),
     "benchmarks": (

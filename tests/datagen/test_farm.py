@@ -80,7 +80,9 @@ def test_a_folder_of_assets(assets, tmp_path):
     assert not list(tmp_path.rglob(".*"))
     cut, moving, quiet = rows = read_index(tmp_path)
     assert (cut.name, cut.sequence, cut.status, cut.sentence) == ("cut", "", "refused", said[0])
-    assert len(cut.sha256) == 64 and cut.seconds > 0
+    assert len(cut.sha256) == 64 and cut.seconds > 0 and cut.cpu_seconds > 0.1 and cut.pictures == 0
+    assert (moving.pictures, quiet.pictures) == (4, 1)
+    assert all(0.3 < row.cpu_seconds < 60 for row in (moving, quiet))  # Blender alone takes half a second to start
     assert (moving.sequence, moving.source, moving.clip) == ("moving/long-way", "moving.glb", "long way")
     assert (moving.sha256, moving.camera_seed, moving.seconds) == (p["sha256"], p["cameras_seed"], p["seconds"])
     assert (quiet.licence, quiet.author, quiet.uid, moving.licence) == ("CC0-1.0", "Ann", "still", "")
@@ -205,12 +207,13 @@ def everything(folder):
     for file in sorted(f for f in folder.rglob("*") if f.is_file()):
         name, data = file.relative_to(folder).as_posix(), file.read_bytes()
         if file.name == "index.parquet":
-            data = pyarrow.parquet.read_table(file).drop_columns("seconds").to_pylist()
+            data = pyarrow.parquet.read_table(file).drop_columns(["seconds", "cpu_seconds"]).to_pylist()
         elif file.name == "index.csv":
-            data = [replace(row, seconds=0) for row in read_index(folder)]
+            data = [replace(row, seconds=0, cpu_seconds=0) for row in read_index(folder)]
         elif file.name in ("transforms.json", "failed.json"):
             data = json.loads(data)
-            (data["provenance"] if "provenance" in data else data["row"]).pop("seconds")
+            for measured in ("seconds", "cpu_seconds"):
+                (data["provenance"] if "provenance" in data else data["row"]).pop(measured)
         found[name] = data
     return found
 

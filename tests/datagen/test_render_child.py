@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from timesplat.datagen.render_child import Limits, held, run_child
+from timesplat.datagen.render_child import Limits, held, render_job, run_child
 from timesplat.datagen.sequence import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="scripts in place of the interpreter, and signals")
@@ -25,7 +25,7 @@ def child(tmp_path, monkeypatch):
         job = {"asset": {"path": "a.glb", "name": "a"}, "out": str(tmp_path / "out")}
         with monkeypatch.context() as m:
             m.setattr(sys, "executable", str(script))
-            run_child(job, messages.append, set(), limits)
+            run.spent = run_child(job, messages.append, set(), limits)
         return messages
 
     return run
@@ -58,6 +58,32 @@ def test_one_that_eats_memory_is_ended_before_it_has_much_more(child):
     assert message["status"] == "memory" and "--limit-memory 0.5 (GB); allow more" in message["error"]
     assert child("x = bytearray(2**26)", Limits(memory=0.5)) == []
     assert 2**22 < held(os.getpid()) < 2**35 and held(2**30) == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "wait4"), reason="this system does not tell what a child took")
+def test_processor_seconds_are_those_of_the_child_and_of_its_own(child):
+    burn = "import time\nwhile time.process_time() < 0.4: pass\n"
+    child(burn)
+    assert 0.4 <= child.spent < 3
+    child(f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {burn!r}])\n{burn}")
+    assert 0.8 <= child.spent < 5
+    child("import time\ntime.sleep(1)")
+    assert child.spent < 0.9
+
+
+def test_what_became_of_a_job(tmp_path, monkeypatch):
+    job, told = {"asset": {"path": "a.glb", "name": "a"}, "out": str(tmp_path)}, []
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "no such program"))
+    became = render_job(job, told.append, set())
+    assert became["error"]["status"] == "crashed" and "a.glb: it could not be started" in became["error"]["error"]
+    script = tmp_path / "python"
+    lines = ('{"warning": "w"}', '{"written": "x"}', '{"error": "first", "status": "refused"}', '{"error": "second"}')
+    script.write_text("#!/bin/sh\n" + "".join(f"echo '{line}'\n" for line in lines))
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    became = render_job(job, told.append, set())
+    assert told == [{"warning": "w"}] and became["written"] == ["x"] and became["error"]["error"] == "first"
+    assert 0 < became["seconds"] < 20
 
 
 def test_what_it_left_half_written_goes(child, tmp_path):

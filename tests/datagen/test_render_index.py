@@ -27,7 +27,7 @@ FOX = Asset("/x/animals/fox.glb", "animals/fox", "/x")
 
 def make_sequence(folder, **provenance):
     folder.mkdir(parents=True)
-    (folder / "transforms.json").write_text(json.dumps({"w": 8, "provenance": provenance}))
+    (folder / "transforms.json").write_text(json.dumps({"w": 8, "frames": [{}, {}], "provenance": provenance}))
     return folder
 
 
@@ -36,7 +36,13 @@ def fox(tmp_path):
     return make_sequence(
         tmp_path / "animals" / "fox" / "Run",
         **{"uid": "fox", "sha256": "ab", "licence": "CC0", "author": "Ann", "clip": "Run", "cameras_seed": 2**32 - 1},
-        **{"blender": "5.0.1", "timesplat": "0.1.0", "seconds": 1.25, "warnings": ["a; b.", 'c, "d"\nü.']},
+        **{
+            "blender": "5.0.1",
+            "timesplat": "0.1.0",
+            "seconds": 1.25,
+            "cpu_seconds": 3.5,
+            "warnings": ["a; b.", 'c, "d"\nü.'],
+        },
     )
 
 
@@ -44,7 +50,7 @@ def test_a_row_says_what_the_sequence_does(fox, tmp_path):
     row = sequence_row(tmp_path, fox, FOX)
     assert row == Row(
         *("animals/fox", "animals/fox/Run", "animals/fox.glb", "fox", "ab", "CC0", "Ann", "Run", 2**32 - 1),
-        *("5.0.1", "0.1.0", 1.25, "rendered", 'a; b. c, "d"\nü.'),
+        *("5.0.1", "0.1.0", 2, 1.25, 3.5, "rendered", 'a; b. c, "d"\nü.'),
     )
     (fox / "transforms.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
@@ -78,6 +84,11 @@ def test_a_damaged_table_is_one_sentence(tmp_path):
     (tmp_path / "index.csv").write_text("name,camera_seed\nx,y\n")
     with pytest.raises(InputError, match=r"index\.csv: the table is damaged .*; remove it"):
         read_index(tmp_path)
+
+
+def test_a_table_of_an_earlier_version_is_read(tmp_path):
+    (tmp_path / "index.csv").write_text("name,sequence,source,seconds,status\nx,x/run,x.glb,2.5,rendered\n")
+    assert read_index(tmp_path) == [Row("x", "x/run", "x.glb", seconds=2.5)]
 
 
 def test_a_failure_stands_for_the_same_file_under_the_same_conditions(tmp_path):

@@ -7,10 +7,11 @@ import time
 
 import pytest
 
-from timesplat.datagen.farm import cores, render_assets
+from timesplat.datagen.farm import render_assets
 from timesplat.datagen.render_child import Limits
 from timesplat.datagen.render_index import FAILURES, read_index
 from timesplat.datagen.render_job import RenderSettings
+from timesplat.datagen.render_pool import cores
 from timesplat.datagen.sequence import read_sequence
 
 from . import torture
