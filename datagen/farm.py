@@ -20,7 +20,6 @@ from . import ASSET_SUFFIXES
 from .licences import Licences, Terms, read_licences
 from .render_child import Limits, remove_half_written, run_child
 from .render_index import (
-    CSV,
     REFUSED,
     Row,
     failure_row,
@@ -30,9 +29,10 @@ from .render_index import (
     needed,
     sequence_row,
     set_terms,
+    table_of,
     write_index,
 )
-from .render_job import ALL_CLIPS, CLIPS, Asset, RenderSettings, file_sha256, list_assets, rendered_sequences
+from .render_job import ALL_CLIPS, CLIPS, Asset, Part, RenderSettings, file_sha256, list_assets, rendered_sequences
 from .render_pool import LocalPool, cores
 from .rigs import RIGS
 from .sequence import InputError, Sequence, read_sequence
@@ -44,6 +44,7 @@ def render_assets(
     settings: RenderSettings | None = None,
     *,
     root: Path | None = None,
+    part: Part | None = None,
     jobs: int = 1,
     limits: Limits | None = None,
     licences: Licences | None = None,
@@ -54,8 +55,8 @@ def render_assets(
     """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<name>/<clip>`, `jobs` at a time, and
     writes the table of all of them (`render_index`). Names are those of `list_assets`; below `root` (by default the
     folder given, or a file's own) paths in files may lead. An asset that goes beyond `limits` is given up; `licences`
-    go into the Sequences. retry False: what failed in an earlier run, under the same settings and limits, is not tried
-    again.
+    go into the Sequences. part: of all these assets only those in it, whose table is one of its own. retry False: what
+    failed in an earlier run, under the same settings and limits, is not tried again.
 
     Returns the folders of all Sequences, those found finished included, and one sentence for each asset that
     failed. `report` gets warnings and failures as they happen, `progress` assets done, in all, and images.
@@ -63,7 +64,7 @@ def render_assets(
     needed()
     settings, out = settings or RenderSettings(), Path(out)
     run = _Run(out, settings, limits or Limits(), licences or Licences())
-    listed = list_assets(assets, root)
+    listed = [asset for asset in list_assets(assets, root) if part is None or part.holds(asset.name)]
     pending = run.sort_out(listed, retry)
     for sentence in run.failures:
         report(sentence)
@@ -82,7 +83,7 @@ def render_assets(
                         report(sentence)
                 progress(done, len(listed), images)
     finally:
-        write_index(out, run.rows)
+        write_index(out, run.rows, part)
     return run.folders, run.failures
 
 
@@ -224,6 +225,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--device", default=defaults.device, choices=["CPU", "GPU"])
     layout_argument(parser)
+    parser.add_argument("--shard", metavar="I/N", help="of these assets the Ith of N parts alone, 1/N to N/N: for "
+                        "machines that are given the same assets; `timesplat report` joins their tables")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=len(cores()), metavar="N", help="assets at a time (%(default)s)")
     parser.add_argument("--limit-seconds", type=float, default=3600.0, metavar="S", help="an asset that takes longer, "
                         "by the clock, is given up (%(default)g)")  # fmt: skip
@@ -246,6 +249,7 @@ def run(args: argparse.Namespace) -> int:
     out = args.out if args.layout == "sequence" else args.out / ".sequences"
     limits = Limits(args.limit_seconds, args.limit_memory)
     licences = read_licences(args.licences) if args.licences else None
+    part = Part.parse(args.shard) if args.shard else None
     with tqdm(total=0, unit="asset", disable=None) as bar:
 
         def progress(done: int, total: int, images: int) -> None:
@@ -260,6 +264,7 @@ def run(args: argparse.Namespace) -> int:
             out,
             settings,
             root=args.root,
+            part=part,
             jobs=args.jobs,
             limits=limits,
             licences=licences,
@@ -270,7 +275,7 @@ def run(args: argparse.Namespace) -> int:
     for folder in folders if out != args.out else ():
         _in_layout(folder, args.out / folder.relative_to(out), args.layout)
     failed = f", {len(failures)} failed (--retry tries them again)" if failures else ""
-    print(f"{len(folders)} sequences in {args.out}{failed}; {out / CSV} has them all")
+    print(f"{len(folders)} sequences in {args.out}{failed}; {table_of(out, part)} has them all")
     return 2 if failures else 0
 
 

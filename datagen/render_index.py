@@ -2,9 +2,10 @@
 """The table of a run, `index.parquet` with `index.csv` beside: a row for every Sequence, and one for every asset that
 failed, so that nothing is lost.
 
-All of it is found again on disk, in the Sequences' provenance and in the `failed.json` that is in a failed asset's
-folder, so that a run which was killed and started again writes the same table, seconds included: they stay as they
-were measured.
+Machines that render parts of the assets into one folder write a table each, `index-2-of-8.csv`; `join_index` makes one
+of them. All of it is found again on disk, in the Sequences' provenance and in the `failed.json` that is in a failed
+asset's folder, so that a run which was killed and started again writes the same table, seconds included: they stay as
+they were measured.
 """
 
 from __future__ import annotations
@@ -12,18 +13,24 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from .errors import InputError
 from .licences import Terms
-from .render_job import Asset
+from .render_job import Asset, Part
 from .whole_folders import write_whole
 
 RENDERED = "rendered"
 FAILURES = REFUSED, CRASHED, TIME, MEMORY = "refused", "crashed", "time", "memory"  # why an asset failed
-CSV, PARQUET, FAILED = "index.csv", "index.parquet", "failed.json"
+FAILED = "failed.json"
+
+
+def table_of(out: Path, part: Part | None = None) -> Path:
+    """The table of a run, or of one of its parts, as CSV; the same as .parquet is beside it."""
+    return out / (f"index-{part.number}-of-{part.of}.csv" if part else "index.csv")
 
 
 @dataclass(frozen=True, order=True)
@@ -48,8 +55,9 @@ class Row:
     sentence: str = ""  # why it failed, or what there is to be said of the Sequence
 
 
-def sequence_row(out: Path, folder: Path, asset: Asset) -> Row:
-    """Of the Sequence in `folder`, which is below the run's folder `out`. Raises InputError."""
+def sequence_row(out: Path, folder: Path, asset: Asset | None = None) -> Row:
+    """Of the Sequence in `folder`, which is below the run's folder `out`; what its asset is called is found out where
+    it is not given. Raises InputError."""
     path = folder / "transforms.json"
     try:
         d = json.loads(path.read_text(encoding="utf-8"))
@@ -57,9 +65,9 @@ def sequence_row(out: Path, folder: Path, asset: Asset) -> Row:
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: it is missing or damaged; render the Sequence again.") from None
     return Row(
-        asset.name,
+        asset.name if asset else folder.parent.relative_to(out).as_posix(),
         folder.relative_to(out).as_posix(),
-        asset.below_root,
+        asset.below_root if asset else str(p.get("path", p.get("asset", ""))),
         **{name: str(p.get(name, "")) for name in ("uid", "sha256", "licence", "author", "clip")},
         camera_seed=int(p.get("cameras_seed", -1)),
         blender=str(p.get("blender", "")),
@@ -100,12 +108,19 @@ def keep_failure(out: Path, row: Row, conditions: dict) -> None:
 def kept_failure(out: Path, asset: Asset, sha256: str, conditions: dict) -> Row | None:
     """The failure of this very file under these conditions; None where there is none."""
     try:
-        kept = json.loads((out / asset.name / FAILED).read_text(encoding="utf-8"))
-        row = Row(**kept["row"])
-        same = kept["conditions"] == conditions and row.source == asset.below_root and row.sha256 == sha256
-    except (OSError, ValueError, KeyError, TypeError):
+        row, under = _read_failure(out / asset.name / FAILED)
+    except InputError:
         return None
-    return row if same else None
+    return row if (under, row.source, row.sha256) == (conditions, asset.below_root, sha256) else None
+
+
+def _read_failure(path: Path) -> tuple[Row, dict]:
+    """What `keep_failure` wrote. Raises InputError."""
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        return Row(**kept["row"]), kept["conditions"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: it is missing or damaged; remove it, and render the asset again.") from None
 
 
 def forget_failure(out: Path, asset: Asset) -> None:
@@ -126,31 +141,57 @@ def set_terms(folder: Path, terms: Terms) -> None:
 # ---------------------------------------------------------------- the table
 
 
-def write_index(out: Path, rows: Iterable[Row]) -> None:
-    """Both files, sorted, each whole or as it was. Rows of other assets of earlier runs stay in it, while
-    their Sequences do. Raises InputError without pyarrow."""
+def write_index(out: Path, rows: Iterable[Row], part: Part | None = None) -> None:
+    """Both files of a run or a part of it, sorted, each whole or as it was. Rows of other assets of earlier runs stay
+    in it, while their Sequences do. Raises InputError without pyarrow."""
     pyarrow, parquet = needed()
     rows = list(rows)
     named = {row.name.lower() for row in rows}
-    others = [row for row in read_index(out) if row.name.lower() not in named]
+    others = [row for row in read_index(out, part) if row.name.lower() not in named]
     rows = sorted([*rows, *(row for row in others if (out / row.sequence).is_dir())])
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [f.name for f in fields(Row)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
-    write_whole(out / CSV, text.getvalue().encode("utf-8", "surrogateescape"))
+    write_whole(table_of(out, part), text.getvalue().encode("utf-8", "surrogateescape"))
     types = {"int": pyarrow.int64(), "float": pyarrow.float64()}
     schema = pyarrow.schema([(f.name, types.get(str(f.type), pyarrow.string())) for f in fields(Row)])
     whole = [{k: _sayable(v) for k, v in asdict(row).items()} for row in rows]
     sink = io.BytesIO()
     parquet.write_table(pyarrow.Table.from_pylist(whole, schema), sink, compression="zstd")
-    write_whole(out / PARQUET, sink.getvalue())
+    write_whole(table_of(out, part).with_suffix(".parquet"), sink.getvalue())
 
 
-def read_index(out: Path) -> list[Row]:
-    """The rows in `index.csv` of a run's folder; none where there is no table. Raises InputError for one that is
-    damaged."""
-    path = out / CSV
+def join_index(out: Path, progress: Callable[[int], None] = lambda found: None) -> list[Row]:
+    """The rows of all that is in a run's folder, whoever rendered it, perhaps copied together from several machines or
+    rendered at this moment; where there are tables of parts, `index.csv` and its .parquet are written with all of them.
+    `progress` gets how many were found. Raises InputError."""
+    rows: list[Row] = []
+    for folder, below, files in os.walk(out):
+        if "transforms.json" in files:
+            rows.append(sequence_row(out, Path(folder)))
+            below.clear()
+        elif FAILED in files:
+            rows.append(_read_failure(Path(folder) / FAILED)[0])
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        progress(len(rows))
+    parts = sorted(out.glob("index-*-of-*.csv"))
+    named = {row.name.lower() for row in rows}
+    tables = [row for path in (table_of(out), *parts) for row in _read(path)]
+    left = {row for row in tables if row.status != RENDERED and row.name.lower() not in named}  # nothing else on disk
+    rows = sorted([*rows, *left])
+    if parts:
+        write_index(out, rows)
+    return rows
+
+
+def read_index(out: Path, part: Part | None = None) -> list[Row]:
+    """The rows in the table of a run, or of a part of it; none where there is no table. Raises InputError for one that
+    is damaged."""
+    return _read(table_of(out, part))
+
+
+def _read(path: Path) -> list[Row]:
     try:
         with open(path, newline="", encoding="utf-8", errors="surrogateescape") as f:
             return [_row(d) for d in csv.DictReader(f)]

@@ -65,6 +65,35 @@ class RenderSettings:
 
 
 @dataclass(frozen=True)
+class Part:
+    """The assets of one of several machines. An asset's name alone decides which part it is in: all machines agree on
+    it, and no asset is in two. InputError for a part that there is not."""
+
+    number: int  # from 1
+    of: int
+
+    def __post_init__(self):
+        if not 1 <= self.number <= self.of:
+            raise InputError(f"--shard {self}: there is no such part; count from 1/{self.of} to {self.of}/{self.of}.")
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
+
+    @staticmethod
+    def parse(text: str) -> Part:
+        """Of "2/8"."""
+        match = re.fullmatch(r"([0-9]{1,9})/([1-9][0-9]{0,8})", text)
+        if not match:
+            raise InputError(f"--shard {text}: not a part; write for example 2/8, the second of eight machines.")
+        return Part(int(match[1]), int(match[2]))
+
+    def holds(self, name: str) -> bool:
+        """Whether the asset of this name is in it; capitals count for nothing, as in `list_assets`."""
+        digest = hashlib.sha256(name.lower().encode("utf-8", "surrogateescape")).digest()
+        return int.from_bytes(digest, "big") % self.of == self.number - 1
+
+
+@dataclass(frozen=True)
 class Asset:
     """One thing to render."""
 

@@ -19,8 +19,8 @@ from timesplat.datagen import farm
 from timesplat.datagen.farm import render_assets, render_shots
 from timesplat.datagen.licences import Licences
 from timesplat.datagen.readers import sequences_in
-from timesplat.datagen.render_index import Row, read_index
-from timesplat.datagen.render_job import RenderSettings
+from timesplat.datagen.render_index import Row, join_index, read_index
+from timesplat.datagen.render_job import Part, RenderSettings
 from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, read_sequence
 
@@ -101,6 +101,21 @@ def test_a_folder_of_assets(assets, tmp_path):
     render_assets([str(assets / "moving.glb")], tmp_path, SMALL, root=assets, licences=other)
     assert [r.licence for r in read_index(tmp_path)] == ["", "MIT", "CC0-1.0"]
     assert read_sequence(tmp_path / "moving" / "long-way").provenance["licence"] == "MIT"
+
+
+def test_machines_that_share_a_folder_render_each_asset_once(assets, tmp_path):
+    everyone = [str(assets), "zoo:3"]
+    parts = [Part(number, 3) for number in (1, 2, 3)]
+    settings = replace(SMALL, passes=False, tracks="none", frames=1)
+    by_part = [render_assets(everyone, tmp_path / "parts", settings, part=p, report=str)[0] for p in parts]
+    told = [read_index(tmp_path / "parts", p) for p in parts]
+    assert sorted(row.name for rows in told for row in rows) == ["cut", "moving", "still", "zoo-000003"]
+    assert sum(map(bool, told)) > 1 and len({f for folders in by_part for f in folders}) == 3
+    rows = join_index(tmp_path / "parts")
+    render_assets(everyone, tmp_path / "whole", settings, report=str)
+    joined, whole = (everything(tmp_path / name) for name in ("parts", "whole"))
+    assert {name: data for name, data in joined.items() if "index-" not in name} == whole
+    assert rows == read_index(tmp_path / "parts")
 
 
 def test_a_second_run_renders_only_what_is_missing(assets, tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 import csv
 import json
+from dataclasses import replace
 
 import pyarrow.parquet
 import pytest
@@ -12,6 +13,7 @@ from timesplat.datagen.render_index import (
     Row,
     failure_row,
     forget_failure,
+    join_index,
     keep_failure,
     kept_failure,
     read_index,
@@ -19,7 +21,7 @@ from timesplat.datagen.render_index import (
     set_terms,
     write_index,
 )
-from timesplat.datagen.render_job import Asset
+from timesplat.datagen.render_job import Asset, Part
 from timesplat.datagen.sequence import InputError
 
 FOX = Asset("/x/animals/fox.glb", "animals/fox", "/x")
@@ -36,6 +38,7 @@ def fox(tmp_path):
     return make_sequence(
         tmp_path / "animals" / "fox" / "Run",
         **{"uid": "fox", "sha256": "ab", "licence": "CC0", "author": "Ann", "clip": "Run", "cameras_seed": 2**32 - 1},
+        path="animals/fox.glb",
         **{
             "blender": "5.0.1",
             "timesplat": "0.1.0",
@@ -84,6 +87,30 @@ def test_a_damaged_table_is_one_sentence(tmp_path):
     (tmp_path / "index.csv").write_text("name,camera_seed\nx,y\n")
     with pytest.raises(InputError, match=r"index\.csv: the table is damaged .*; remove it"):
         read_index(tmp_path)
+
+
+def test_tables_of_parts_are_joined_and_nothing_is_lost(fox, tmp_path):
+    whole = sequence_row(tmp_path, fox, FOX)
+    assert sequence_row(tmp_path, fox) == replace(whole, source="animals/fox.glb")
+    assert join_index(tmp_path) == [whole] and not (tmp_path / "index.csv").exists()  # it is the run's own to write
+    owl = failure_row(Asset("/x/owl.glb", "owl", "/x"), "owl", TIME, sha256="cd", cpu_seconds=2)
+    keep_failure(tmp_path, owl, {})
+    nowhere = failure_row(Asset("/x/no.glb", "no", "/x"), "no", REFUSED)  # the disk was full
+    (tmp_path / "animals" / ".fox.12-ab").mkdir()  # being rendered
+    (tmp_path / "animals" / ".fox.12-ab" / "transforms.json").write_text("{")
+    write_index(tmp_path, [whole], Part(1, 2))
+    fox_once_failed = failure_row(FOX, "fox.glb: no.", TIME)
+    write_index(tmp_path, [owl, nowhere, fox_once_failed], Part(2, 2))
+    assert read_index(tmp_path) == [] and read_index(tmp_path, Part(1, 2)) == [whole]
+    found = []
+    rows = join_index(tmp_path, found.append)
+    assert rows == read_index(tmp_path) == [whole, nowhere, owl] and found[-1] == 2
+    assert pyarrow.parquet.read_table(tmp_path / "index.parquet").num_rows == 3
+    before = (tmp_path / "index.parquet").read_bytes()
+    assert join_index(tmp_path) == rows and (tmp_path / "index.parquet").read_bytes() == before
+    (tmp_path / "owl" / "failed.json").write_text("{")
+    with pytest.raises(InputError, match=r"failed\.json: it is missing or damaged; .*\.$"):
+        join_index(tmp_path)
 
 
 def test_a_table_of_an_earlier_version_is_read(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 
 from timesplat.datagen.render_job import (
     Asset,
+    Part,
     RenderSettings,
     asset_name,
     list_assets,
@@ -84,6 +85,22 @@ def test_files_given_alone(tmp_path):
     assert named(tmp_path, *files, given=files, root=tmp_path) == {"a/scene.gltf": "a/scene", "b/scene.gltf": "b/scene"}
     with pytest.raises(InputError, match=r"outside of --root [^\n]*;[^\n]*\.$"):
         named(tmp_path, *files, given=files, root=tmp_path / "a")
+
+
+def test_every_asset_is_in_just_one_part():
+    names = [f"zoo-{i:06d}" for i in range(3000)]
+    parts = [[n for n in names if Part(i, 7).holds(n)] for i in range(1, 8)]
+    assert sorted(name for part in parts for name in part) == names and all(360 < len(part) < 500 for part in parts)
+    assert Part.parse("2/7") == Part(2, 7) and Part(1, 1).holds("anything")
+    assert [Part(i, 3).holds("Chair/Scene") for i in (1, 2, 3)] == [Part(i, 3).holds("chair/scene") for i in (1, 2, 3)]
+    # as everywhere and for ever: int(sha256("zoo-000007").hexdigest(), 16) % 8 == 5
+    assert [i for i in range(1, 9) if Part(i, 8).holds("zoo-000007")] == [6]
+
+
+@pytest.mark.parametrize("wrong", ["0/4", "5/4", "1/0", "2", "a/b", "-1/3", "1/2/3", "²/3"])
+def test_parts_that_there_are_not(wrong):
+    with pytest.raises(InputError, match=r"^--shard [^\n]*;[^\n]*\.$"):
+        Part.parse(wrong)
 
 
 def test_nothing_is_finished_where_nothing_is(tmp_path):
