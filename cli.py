@@ -127,7 +127,7 @@ def import_(args: argparse.Namespace) -> int:
     return 0
 
 
-# ---------------------------------------------------------------- fetch, render, curate, pack
+# ---------------------------------------------------------------- fetch, render, report, curate, pack
 
 
 def fetch_arguments(p: argparse.ArgumentParser) -> None:
@@ -152,6 +152,20 @@ def render_arguments(p: argparse.ArgumentParser) -> None:
 def render(args: argparse.Namespace) -> int:
     """Render assets (glTF, FBX, OBJ, USD, .blend, procedural zoo) into Sequences: posed images, depth, motion."""
     from .datagen.farm import run
+
+    return run(args)
+
+
+def report_arguments(p: argparse.ArgumentParser) -> None:
+    from .evaluation.render_report import add_arguments
+
+    add_arguments(p)
+
+
+def report(args: argparse.Namespace) -> int:
+    """Say what a run of `render` made, what failed and why, what it cost, and with --project what more would take. Of a
+    run by `--shard` it joins the tables."""
+    from .evaluation.render_report import run
 
     return run(args)
 
@@ -446,6 +460,7 @@ COMMANDS = {
     "demo": (demo_arguments, demo, "the whole road in one go, with pictures"),
     "fetch": (fetch_arguments, fetch, "objects of Objaverse, with their licences"),
     "render": (render_arguments, render, "assets to Sequences (Blender)"),
+    "report": (report_arguments, report, "what was rendered, what it cost, what more would"),
     "curate": (curate_arguments, curate, "Sequences into sets for training, and out"),
     "pack": (pack_arguments, pack, "Sequences into shards that train reads"),
     "inspect": (inspect_arguments, inspect, "what others' pictures and cameras are"),

@@ -202,6 +202,17 @@ def _packed(seq: Sequence, settings: PackSettings) -> tuple[dict, list[tuple[str
     return about, files, motion_of([np.stack(shots) for shots in ordered])
 
 
+def bytes_in_shard(seq: Sequence, settings: PackSettings) -> dict[str, int]:
+    """How large a clip is in a shard: bytes by the ending of its files, "json", "webp" or "png", "exr", with what tar
+    adds. Raises InputError."""
+    about, files, _ = _packed(seq, settings)
+    sizes: dict[str, int] = {}
+    for end, size in (("json", len(json.dumps(about))), *((name, len(data)) for name, data in files)):
+        kind = end.rpartition(".")[2]
+        sizes[kind] = sizes.get(kind, 0) + _BLOCK + -(-size // _BLOCK) * _BLOCK
+    return sizes
+
+
 def _bytes(seq: Sequence, relative: str) -> bytes:
     try:
         return (seq.folder / relative).read_bytes()

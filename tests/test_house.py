@@ -44,7 +44,7 @@ LAYERS = {
         ("evaluation.scoring",),
         ("evaluation.runner",),
         ("evaluation.tables", "evaluation.bench_summary", "evaluation.charts"),
-        ("evaluation.scaling", "evaluation.recipe"),
+        ("evaluation.scaling", "evaluation.recipe", "evaluation.render_report"),
         (
             "evaluation.evaluate",
             "evaluation.bench",
