@@ -11,7 +11,7 @@ from .datagen.sequence import InputError
 BAD_INPUT, STOPPED, NOBODY_READS = 2, 130, 141  # as shells have it: 128 + SIGINT, 128 + SIGPIPE
 # The extra of pyproject.toml that brings a package.
 EXTRAS = {"bpy": "render", "OpenEXR": "render", "torch": "torch", "numba": "torch", "safetensors": "torch"}
-EXTRAS |= {"pxr": "usd", "matplotlib": "figures", "av": "video", "fourdgs": "fourdgs"}
+EXTRAS |= {"pxr": "usd", "matplotlib": "figures", "av": "video", "fourdgs": "fourdgs", "ray": "ray"}
 
 
 def exit_code(program: str, call: Callable[[], int | None]) -> int:

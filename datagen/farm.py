@@ -18,6 +18,7 @@ from pathlib import Path
 from .. import __version__
 from . import ASSET_SUFFIXES
 from .licences import Licences, Terms, read_licences
+from .ray_pool import LOCAL, RayPool
 from .render_child import Limits, remove_half_written, run_child
 from .render_index import (
     REFUSED,
@@ -46,6 +47,7 @@ def render_assets(
     root: Path | None = None,
     part: Part | None = None,
     jobs: int = 1,
+    ray: str | None = None,
     limits: Limits | None = None,
     licences: Licences | None = None,
     retry: bool = True,
@@ -55,8 +57,9 @@ def render_assets(
     """Renders every asset (a file, a folder of files, or "zoo:SEED") to `out/<name>/<clip>`, `jobs` at a time, and
     writes the table of all of them (`render_index`). Names are those of `list_assets`; below `root` (by default the
     folder given, or a file's own) paths in files may lead. An asset that goes beyond `limits` is given up; `licences`
-    go into the Sequences. part: of all these assets only those in it, whose table is one of its own. retry False: what
-    failed in an earlier run, under the same settings and limits, is not tried again.
+    go into the Sequences. ray: the address of a Ray cluster that renders in place of this machine, LOCAL for one of
+    `jobs` cores here; as many at a time as it has cores. part: of all these assets only those in it, whose table is one
+    of its own. retry False: what failed in an earlier run, under the same settings and limits, is not tried again.
 
     Returns the folders of all Sequences, those found finished included, and one sentence for each asset that
     failed. `report` gets warnings and failures as they happen, `progress` assets done, in all, and images.
@@ -65,13 +68,14 @@ def render_assets(
     settings, out = settings or RenderSettings(), Path(out)
     run = _Run(out, settings, limits or Limits(), licences or Licences())
     listed = [asset for asset in list_assets(assets, root) if part is None or part.holds(asset.name)]
+    cluster = None if ray is None else RayPool(ray, jobs, run.limits)
     pending = run.sort_out(listed, retry)
     for sentence in run.failures:
         report(sentence)
     done, images = len(listed) - len(pending), 0
     progress(done, len(listed), images)
     try:
-        with LocalPool(max(1, min(jobs, len(pending))), run.limits) as pool:
+        with cluster or LocalPool(max(1, min(jobs, len(pending))), run.limits) as pool:
             for message in pool.render([run.job(task) for task in pending]):
                 if "warning" in message:
                     report(message["warning"])
@@ -228,6 +232,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shard", metavar="I/N", help="of these assets the Ith of N parts alone, 1/N to N/N: for "
                         "machines that are given the same assets; `timesplat report` joins their tables")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=len(cores()), metavar="N", help="assets at a time (%(default)s)")
+    parser.add_argument("--ray", nargs="?", const=LOCAL, metavar="ADDRESS", help="hand the assets out by Ray: to the "
+                        "cluster at this address, or to one of --jobs cores that is started here; needs the extra "
+                        "`ray`")  # fmt: skip
     parser.add_argument("--limit-seconds", type=float, default=3600.0, metavar="S", help="an asset that takes longer, "
                         "by the clock, is given up (%(default)g)")  # fmt: skip
     parser.add_argument("--limit-memory", type=float, metavar="GB", help="an asset that needs more is given up "
@@ -266,6 +273,7 @@ def run(args: argparse.Namespace) -> int:
             root=args.root,
             part=part,
             jobs=args.jobs,
+            ray=args.ray,
             limits=limits,
             licences=licences,
             retry=args.retry,

@@ -82,6 +82,7 @@ LAYERS = {
         ("datagen.licences", "datagen.render_index"),
         ("datagen.render_setup", "datagen.tracks", "datagen.render_child"),
         ("datagen.capture", "datagen.render_pool"),
+        ("datagen.ray_pool",),
         ("datagen.render_asset", "datagen.render_trials", "datagen.farm"),
     ),
     "benchmarks": (

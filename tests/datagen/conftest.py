@@ -31,3 +31,28 @@ def two_clips(tmp_path_factory):
     a.location, b.location, b.scale, tall.value = (0, 0, 0), (0, 4, 0), (1, 1, 1), 0
     bpy.context.scene.frame_set(0)  # the exporter takes the rest pose from what this frame shows
     return export_glb(tmp_path_factory.mktemp("clips") / "two.glb")
+
+
+@pytest.fixture(scope="session")
+def small_assets(tmp_path_factory):
+    """A folder with a moving cube of two clips, a cube that stands still, and a file that is cut."""
+    folder = tmp_path_factory.mktemp("assets")
+    empty_session()
+    bpy.ops.mesh.primitive_cube_add()
+    ob = bpy.context.object
+    for name, way in (("short way", 1), ("long way", 3)):
+        for frame in (0, 10):
+            ob.location = (way * frame / 10, 0, 0)
+            ob.keyframe_insert("location", frame=frame)
+        action = ob.animation_data.action
+        track = ob.animation_data.nla_tracks.new()
+        track.name = name
+        track.strips.new(name, 0, action)
+        ob.animation_data.action = None
+    options = {"export_animation_mode": "NLA_TRACKS"}
+    bpy.ops.export_scene.gltf(filepath=str(folder / "moving.glb"), **options)
+    ob.animation_data_clear()
+    bpy.ops.export_scene.gltf(filepath=str(folder / "still.glb"), **options)
+    whole = (folder / "moving.glb").read_bytes()
+    (folder / "cut.glb").write_bytes(whole[: len(whole) // 2])
+    return folder

@@ -5,7 +5,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -24,34 +23,15 @@ from timesplat.datagen.render_job import Part, RenderSettings
 from timesplat.datagen.scene.open import empty_session
 from timesplat.datagen.sequence import InputError, read_sequence
 
+from .killing import KILLS, ZOO, everything, survives
 from .writers.conftest import make as make_sequence
 
 SMALL = RenderSettings(rig="alternating", frames=4, size=24, samples=1)
 
 
 @pytest.fixture(scope="module")
-def assets(tmp_path_factory):
-    """A folder with a moving cube of two clips, a cube that stands still, and a file that is cut."""
-    folder = tmp_path_factory.mktemp("assets")
-    empty_session()
-    bpy.ops.mesh.primitive_cube_add()
-    ob = bpy.context.object
-    for name, way in (("short way", 1), ("long way", 3)):
-        for frame in (0, 10):
-            ob.location = (way * frame / 10, 0, 0)
-            ob.keyframe_insert("location", frame=frame)
-        action = ob.animation_data.action
-        track = ob.animation_data.nla_tracks.new()
-        track.name = name
-        track.strips.new(name, 0, action)
-        ob.animation_data.action = None
-    options = {"export_animation_mode": "NLA_TRACKS"}
-    bpy.ops.export_scene.gltf(filepath=str(folder / "moving.glb"), **options)
-    ob.animation_data_clear()
-    bpy.ops.export_scene.gltf(filepath=str(folder / "still.glb"), **options)
-    whole = (folder / "moving.glb").read_bytes()
-    (folder / "cut.glb").write_bytes(whole[: len(whole) // 2])
-    return folder
+def assets(small_assets):
+    return small_assets
 
 
 def test_a_folder_of_assets(assets, tmp_path):
@@ -216,55 +196,16 @@ def test_a_child_that_dies_is_one_sentence(assets, tmp_path, monkeypatch):
 # ---------------------------------------------------------------- killed, and started again
 
 
-def everything(folder):
-    """{path: what is in the file} of a run, without the seconds that things took and without what was not whole."""
-    found = {}
-    for file in sorted(f for f in folder.rglob("*") if f.is_file()):
-        name, data = file.relative_to(folder).as_posix(), file.read_bytes()
-        if file.name == "index.parquet":
-            data = pyarrow.parquet.read_table(file).drop_columns(["seconds", "cpu_seconds"]).to_pylist()
-        elif file.name == "index.csv":
-            data = [replace(row, seconds=0, cpu_seconds=0) for row in read_index(folder)]
-        elif file.name in ("transforms.json", "failed.json"):
-            data = json.loads(data)
-            for measured in ("seconds", "cpu_seconds"):
-                (data["provenance"] if "provenance" in data else data["row"]).pop(measured)
-        found[name] = data
-    return found
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.parametrize(
-    "kills", [3, pytest.param(20, marks=pytest.mark.slow)]
-)  # slow: Blender starts 20 times or more
+@pytest.mark.skipif(sys.platform != "linux", reason="signals, /proc")
+@pytest.mark.parametrize("kills", [2, pytest.param(KILLS, marks=pytest.mark.slow)])
 def test_killed_at_any_moment_it_ends_with_the_same(assets, tmp_path, kills):
-    words = [str(assets), "--size", "16", "--samples", "1", "--frames", "2", "--rig", "alternating", "--clip", "all"]
-    command = [sys.executable, "-m", "timesplat.cli", "render", *words, "--jobs", "2", "--out"]
+    def kill(process, number):
+        """The whole group, or the parent alone, whose children have to notice."""
+        (os.killpg if number % 2 else os.kill)(process.pid, signal.SIGKILL)
+        process.wait()
+        return 1
 
-    def start(out):
-        pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-        return subprocess.Popen([*command, str(out)], start_new_session=True, **pipes)
-
-    begin = time.monotonic()
-    whole = start(tmp_path / "whole")
-    told = whole.communicate()[1].decode()
-    took = time.monotonic() - begin
-    assert whole.returncode == 2 and "cut.glb" in told and len(read_index(tmp_path / "whole")) == 4
-    moments, killed = random.Random(kills), 0
-    for i in range(kills):
-        process = start(tmp_path / "killed")
-        try:
-            process.wait(moments.uniform(0.1, 1.0) * took)
-        except subprocess.TimeoutExpired:
-            # the whole group, or the parent alone, whose children have to notice
-            (os.killpg if i % 2 else os.kill)(process.pid, signal.SIGKILL)
-            process.wait()
-            killed += 1
-        process.stderr.close()
-    assert killed
-    last = start(tmp_path / "killed")
-    last.communicate()
-    assert last.returncode == 2 and everything(tmp_path / "killed") == everything(tmp_path / "whole")
+    assert survives([assets, *ZOO[: kills // 3]], tmp_path, kills, random.Random(kills), kill)
 
 
 # ---------------------------------------------------------------- what is not as it should be
