@@ -69,7 +69,7 @@ def report_line(state: RunState, results: Sequence[StepResult], samples: int, ti
     if timer.device.startswith("cuda"):
         line["cuda_memory"] = round(torch.cuda.max_memory_allocated(timer.device) / 2**20)
     line |= {"skipped": state.skipped_steps, "bad": state.nonfinite_samples}
-    line["share"] = {k: round(x, 2) for k, x in timer.fractions.items()}
+    line["share"] = {k: round(x, 3) for k, x in timer.fractions.items()}
     return line
 
 

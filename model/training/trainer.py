@@ -167,6 +167,7 @@ class Trainer:
                 if state.step % INTERVALS.report == 0:
                     line = self._report(results)
                     text = " {step} loss {loss:.4f} psnr {psnr:.2f} {samples_per_s} samples/s"
+                    text += ", {share[data]:.0%} data wait"
                     bar.set_postfix_str(text.format(**line))
                     results = []
                 bar.update(self.progress() - bar.n)
