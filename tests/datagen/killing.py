@@ -76,6 +76,7 @@ def survives(words, folder, kills, rng, kill):
         except subprocess.TimeoutExpired:
             assert killed < kills
             killed += kill(process, killed)
+            print(f"{killed} of {kills} kills, {ends} runs came to their end", flush=True)
             if process.poll() is not None:
                 process = start(out, words)
             continue
