@@ -243,7 +243,8 @@ def _projection(folder: Path, cost: Cost, count: int, mbit: float) -> list[str]:
     if cost.download is not None:
         hours_of_link = count * cost.download * 8 / (mbit * 1e6) / 3600
         size = _terabytes(count * cost.download)
-        table.append(("download", f"{size}: {hours_of_link:,.1f} hours at {mbit:g} Mbit/s"))
+        each = f"{cost.download / 1e6:.2f} MB a file"
+        table.append(("download", f"{size}, {each}: {hours_of_link:,.1f} hours at {mbit:g} Mbit/s"))
     lines = ["", f"## {count:,} such assets", "", "| | |", "|---|---|"]
     lines += [f"| {name} | {text} |" for name, text in table]
     return [*lines, "", *_first(folder, cost, count, mbit)]

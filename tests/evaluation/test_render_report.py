@@ -60,7 +60,7 @@ def test_what_more_would_take(run, tmp_path, capsys, monkeypatch):
     code, text = told(capsys, run, "--project", 3_600_000, "--assets", tmp_path / "in", "--mbit", 8, "--out", out)
     assert code == 0 and out.read_text() == text
     assert "| core-hours | 2,200: 1.4 days of 64 cores |" in text
-    assert "| download | 7.20 GB: 2.0 hours at 8 Mbit/s |" in text  # 2,000 bytes each
+    assert "| download | 7.20 GB, 0.00 MB a file: 2.0 hours at 8 Mbit/s |" in text  # 2,000 bytes each
     assert "takes as long as the rendering on 1,100 cores" in text  # 2.2 seconds to 0.002
     cost = Cost(5, 2.2, 4, 10, {"pictures": 1e6}, {"webp": 5e5, "exr": 1e6}, None)
     monkeypatch.setattr(render_report.shutil, "disk_usage", lambda folder: type("", (), {"free": 10e6}))
