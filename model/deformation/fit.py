@@ -4,14 +4,14 @@ share, moved by control points (SC-GS, Huang et al. 2024), and both fitted to th
 
 Where things move fast, what a view shows is far from where it was in the views that are known, and no gradient leads
 there. So a fit begins in the middle of the clip and goes on to its ends; motion is a table of several levels
-(`motion_table.py`), smooth in time until all of the clip is looked at, and sharper then; pictures are small at first;
-and neighbours are held together less and less.
+(`motion_table.py`), smooth in time until all of the clip is looked at, then sharper and with places chosen anew,
+among what has been found; pictures are small at first; and neighbours are held together less and less.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -63,6 +63,7 @@ class DeformFit:
 
 
 FIT = DeformFit()
+ALONE = replace(FIT, motion=(0.05, 0.0036), bending=(0.05, 0.01))  # where a time is seen by fewer than SEVERAL views
 SMALLEST = 128  # pixels of the longest side, from which pictures grow to what they are
 SHARES = {1: (0.6,), 2: (0.6, 0.85), 3: (0.5, 0.8, 0.93)}  # of the schedule after which they do, by how often
 
@@ -96,21 +97,21 @@ class _Fit:
     """The state of a fit, and what its steps ask for."""
 
     def __init__(self, views: Views, max_gaussians: int, seed: int):
-        fit = self.fit = FIT
+        self.several = len(views) >= SEVERAL * len(views.time.unique())
+        fit = self.fit = FIT if self.several else ALONE
         self.views, self.pixel = views, pixel_size(views)
         self.pyramid = pyramid_of(max(views.size))
         smaller = reduction(views, self.pyramid[0][1])
         self.stages = _stages(self.pyramid, views, max_gaussians)
         self.stage = self.stages[0]
         self.generator = torch.Generator().manual_seed(seed)
-        self.sharp = SHARP[len(views) >= SEVERAL * len(views.time.unique())]
         order = views.time.abs().argsort(stable=True)
         at_once = int((views.time == views.time[order[0]]).sum())
         middle = views[order[: max(fit.first_views, at_once)]]
         self.whole = is_whole(views)
         points, most = (points_around, SCENE_START) if self.whole else (points_inside, fit.start)
         xyz, rgb = points(middle, min(most, self.stage.gaussians), self.generator)
-        self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.generator)
+        self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.several, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
         first, last = fit.xyz
         rates["xyz"] = first * self.pixel * smaller, last * self.pixel
@@ -135,11 +136,23 @@ class _Fit:
         }
 
     @torch.no_grad()
+    def _found(self) -> Tensor:
+        """(N,3) where something is seen to be."""
+        seen, points = self.parameters["opacity"].sigmoid() > SEEN, self.parameters["xyz"].detach()
+        return points[seen] if seen.sum() > 1 else points
+
     def _place(self) -> None:
-        p = self.parameters
-        seen = p["opacity"].sigmoid() > SEEN
-        points = p["xyz"].detach()
-        self.control = ControlPoints.among(points[seen] if seen.sum() > 1 else points, self.table, self.generator)
+        self.control = ControlPoints.among(self._found(), self.table, self.generator)
+
+    def _sharpen(self) -> None:
+        """Once all of the clip is looked at: moments count over a shorter time, and places, which were among what the
+        silhouettes left possible, are now among what has been found."""
+        values = self.parameters["motion"].detach()
+        self.table.sharpen(values, SHARP[self.several])
+        self.table, values = self.table.among(values, self._found(), self.generator)
+        self.parameters.replace("motion", values)
+        self._place()
+        self._bind()
 
     @torch.no_grad()
     def _bind(self) -> None:
@@ -189,8 +202,8 @@ class _Fit:
         return photometric_loss(step, f.ssim_weight) + a * cloud.opacity.mean() + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
-        if fraction >= self.fit.window and self.table.width > self.sharp:
-            self.table.sharpen(self.parameters["motion"].detach(), self.sharp)
+        if fraction >= self.fit.window and self.table.width > SHARP[self.several]:
+            self._sharpen()
         if self._at(fraction) is not self.stage:
             self.stage = self._at(fraction)
             self.densifier = self._densifier()

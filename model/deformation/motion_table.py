@@ -3,7 +3,9 @@
 
 There are several levels of places, a single one, a dozen, …, some hundreds, whose motions add up: what moves together
 is found at once, and by all views, and what moves by itself is left to the fine ones. A table finds fast motion where
-a network over place and time (as of SC-GS) stays behind: of running animals 4 dB and more.
+a network over place and time (as of SC-GS) stays behind: of running animals 4 dB and more. Where each moment is seen by
+a view or two, there are fewer fine places, and the motion of a moment is added to one that takes several: what a view
+does not show is then as neighbouring times have it.
 """
 
 from __future__ import annotations
@@ -15,13 +17,14 @@ from torch import Tensor
 
 from .posing import Pose
 
-LEVELS = (1, 12, 48, 192, 600)  # places of each
+LEVELS = (1, 12, 48, 192, 600)  # places of each; the last only where a time is seen by SEVERAL views
 MOMENTS = 40  # at the most
 NEAREST = 8  # places of a level that move a point
 BEYOND = 2  # moments before the clip, and after it
 WIDTH = 1.5  # σ of a moment's influence, in moments, while motion is looked for …
-SHARP = 1.0, 0.7  # … and when it is found, where a time is seen by one view, and by SEVERAL
+SHARP = 1.0, 0.7  # … and when it is found, where a time is seen by fewer than SEVERAL views, and by more
 SEVERAL = 4
+SLOW = 4  # moments between those of the slow part
 
 
 def spread_points(points: Tensor, count: int, generator: torch.Generator, among: int = 20_000) -> Tensor:
@@ -37,42 +40,69 @@ def spread_points(points: Tensor, count: int, generator: torch.Generator, among:
     return points[taken]
 
 
+def _reach(levels: list[Tensor]) -> list[float]:
+    """σ of a place's influence, of each level (P,3): the median distance to the nearest other."""
+    apart = (float(torch.cdist(p, p).topk(2, largest=False).values[:, 1].median()) for p in levels[1:])
+    return [2.0] + [max(a, 1e-3) for a in apart]
+
+
 @dataclass
 class MotionTable:
-    """Where the values are, which are trained: (M,P,6), how far a place goes, and the axis about which it turns times
-    (for small ones) the angle, 0 at first; smoothed over neighbouring moments."""
+    """Where the values are, which are trained: (M+S,P,6), how far a place goes, and the axis about which it turns times
+    (for small ones) the angle, 0 at first; smoothed over neighbouring moments. Those of the slow part are added."""
 
     levels: list[Tensor]  # (P_l,3) places of each, at rest; P in all
     reach: list[float]  # σ of a place's influence, of each level
     moments: Tensor  # (M,) model times, evenly from before -1 to after 1, so that the ends are smoothed like the rest
+    slow: Tensor  # (S,) those of the slow part, likewise; none where a time is seen by SEVERAL views
 
     @staticmethod
-    def around(points: Tensor, frames: int, generator: torch.Generator) -> MotionTable:
-        """For an object of which points (N,3) are known, 1 or more, in a clip of so many frames."""
-        levels = [spread_points(points, n, generator) for n in LEVELS if n <= len(points)]
-        reach = [2.0] + [float(torch.cdist(p, p).topk(2, largest=False).values[:, 1].median()) for p in levels[1:]]
+    def around(points: Tensor, frames: int, several: bool, generator: torch.Generator) -> MotionTable:
+        """For an object of which points (N,3) are known, 1 or more, in a clip of so many frames. several: whether a
+        time is seen by SEVERAL views."""
+        kept = LEVELS if several else LEVELS[:-1]
+        levels = [spread_points(points, n, generator) for n in kept if n <= len(points)]
         count = min(max(frames, 2), MOMENTS)
         last = 1 + BEYOND * 2 / (count - 1)
-        return MotionTable(levels, [max(r, 1e-3) for r in reach], torch.linspace(-last, last, count + 2 * BEYOND))
+        moments = torch.linspace(-last, last, count + 2 * BEYOND)
+        slow = torch.linspace(-last, last, 0 if several else -(-(len(moments) - 1) // SLOW) + 1)
+        return MotionTable(levels, _reach(levels), moments, slow)
 
     width: float = WIDTH  # σ of a moment's influence, in moments
 
     def _share(self, t: Tensor) -> Tensor:
-        """t (T,) -> how much each moment counts then (T,M), in all 1."""
+        """t (T,) -> how much each moment counts then (T,M+S), in all 1 of either part."""
         apart = float(self.moments[1] - self.moments[0])
-        share = torch.exp(-0.5 * ((t[:, None] - self.moments) / (self.width * apart)).square())
-        return share / share.sum(1, keepdim=True)
+        shares = []
+        for moments, width in ((self.moments, self.width), (self.slow, SLOW)):
+            share = torch.exp(-0.5 * ((t[:, None] - moments) / (width * apart)).square())
+            share = share * (share > 1e-3 * share.amax(1, keepdim=True)) if len(moments) else share  # of many, a few
+            shares.append(share / share.sum(1, keepdim=True))
+        return torch.cat(shares, 1)
 
     @torch.no_grad()
     def sharpen(self, values: Tensor, width: float) -> None:
-        """Has each moment count over a shorter time from now on; values (M,P,6) become what they came to at their
+        """Has each moment count over a shorter time from now on; values (M+S,P,6) become what they came to at their
         moments, so that the motion stays about as it is."""
-        values.copy_(torch.einsum("mn,npc->mpc", self._share(self.moments), values))
+        own = len(self.moments)
+        values[:own] = torch.einsum("mn,npc->mpc", self._share(self.moments)[:, :own], values[:own])
         self.width = width
+
+    @torch.no_grad()
+    def among(self, values: Tensor, points: Tensor, generator: torch.Generator) -> tuple[MotionTable, Tensor]:
+        """A table whose places are among points (N,3), 1 or more, and values with which all of these move about as
+        they do with `values` (M+S,P,6): as the finest level has it, to which the others will add."""
+        levels = [spread_points(points, len(places), generator) for places in self.levels if len(places) <= len(points)]
+        table = MotionTable(levels, _reach(levels), self.moments, self.slow, self.width)
+        weights, moved = self.weights(levels[-1]), table.zeros()
+        for m, t in enumerate(self.moments.tolist()):
+            place, turn = self.pose(values, weights, levels[-1], t)
+            moved[m, -len(place) :] = torch.cat([place - levels[-1], 2 * turn[:, 1:] / turn[:, :1]], 1)
+        return table, moved
 
     def zeros(self) -> Tensor:
         """The values at rest."""
-        return torch.zeros(len(self.moments), sum(map(len, self.levels)), 6)
+        return torch.zeros(len(self.moments) + len(self.slow), sum(map(len, self.levels)), 6)
 
     def weights(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """points (C,3) -> the places that move each (C,S) int32, the NEAREST of each level, and how much (C,S): of a
@@ -89,5 +119,5 @@ class MotionTable:
     def pose(self, values: Tensor, weights: tuple[Tensor, Tensor], points: Tensor, t: float) -> tuple[Tensor, Tensor]:
         """Where points (C,3) with these weights are at time t (C,3), and their unit quaternions (C,4)."""
         share = self._share(torch.tensor([t]))[0]
-        now = (share > 1e-3 * share.max()).nonzero()[:, 0]
-        return Pose.apply(now.int(), share[now] / share[now].sum(), *weights, points, values)
+        now = share.nonzero()[:, 0]
+        return Pose.apply(now.int(), share[now], *weights, points, values)

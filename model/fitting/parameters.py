@@ -84,6 +84,11 @@ class Parameters:
             self.values[k].grad = None if old.grad is None else old.grad[keep]
             self.moments[k] = tuple(m[keep].clone() for m in self.moments[k])
 
+    def replace(self, name: str, value: Tensor) -> None:
+        """Puts other values in the place of those of this name; of any shape, with moments of 0 and no gradient."""
+        self.values[name] = value.detach().clone().requires_grad_()
+        self.moments[name] = (torch.zeros_like(value), torch.zeros_like(value))
+
     @torch.no_grad()
     def reset_moments(self, rows: Tensor) -> None:
         """Sets Adam's moments of these rows ((K,) indices or mask (N,)) to 0, as for newly made ones."""

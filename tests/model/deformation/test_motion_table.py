@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The table of motion: at rest nothing moves, what all places do everything does, and levels add up."""
 
+import pytest
 import torch
 
 from timesplat.model.deformation.motion_table import MotionTable, spread_points
 
 
-def a_table(count=700):
+def a_table(count=700, several=True):
     g = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=g)
-    return MotionTable.around(points, 10, g), points
+    return MotionTable.around(points, 10, several, g), points
 
 
 def test_at_rest_nothing_moves():
@@ -69,3 +70,38 @@ def test_spread_points_lie_apart():
     nearest = [float((torch.cdist(p, p) + 9 * torch.eye(20)).min()) for p in (chosen, random)]
     assert nearest[0] > 2 * nearest[1]
     assert len(spread_points(points[:5], 20, g)) == 5
+
+
+def test_where_views_are_few_a_slow_part_is_added_and_fewer_places_are_there():
+    table, points = a_table(several=False)
+    assert [len(places) for places in table.levels] == [1, 12, 48, 192] and len(table.slow) == 5
+    weights, values = table.weights(points), table.zeros()
+    assert values.shape == (len(table.moments) + 5, 253, 6)
+    values[len(table.moments) :, :, 0] = 0.1
+    place, _ = table.pose(values, weights, points, 0.7)
+    assert torch.allclose(place, points + torch.tensor([0.4, 0, 0]), atol=1e-6)
+    values.zero_()
+    values[len(table.moments) + 2] = 1.0  # of the slow part the middle one, which counts long
+    values[len(table.moments) // 2] = 1.0  # of the other, which does not
+    values[..., 1:] = 0
+    near, far = (float((table.pose(values, weights, points[:1], t)[0] - points[:1])[0, 0]) for t in (0.0, 0.9))
+    assert near > 1.5 and 0.4 < far < 1.6
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_all_moves_on_as_it_did_among_other_places(several):
+    table, _ = a_table(several=several)
+    g = torch.Generator().manual_seed(1)
+    values, own = table.zeros(), len(table.moments)
+    turned = torch.stack([0.2 * table.moments, 0.1 * table.moments.square()], 1) / len(table.levels)
+    values[:own, :, 0], values[:own, :, 4] = turned[:, :1], turned[:, 1:]
+    values[own:, :, 2] = 0.05
+    table.sharpen(values, 0.7)
+    found = 0.5 + 0.3 * torch.rand(400, 3, generator=g)  # the object was smaller than thought
+    other, moved = table.among(values, found, g)
+    assert [len(x) for x in other.levels] == [n for n in (1, 12, 48, 192, 600)[: 4 + several] if n <= 400]
+    assert all(any((place == found).all(1)) for places in other.levels for place in places)
+    for t in (-1.0, -0.3, 0.5):
+        before, turn = table.pose(values, table.weights(found), found, t)
+        after, turn_after = other.pose(moved, other.weights(found), found, t)
+        assert (after - before).abs().max() < 0.01 and (turn_after - turn).abs().max() < 0.01

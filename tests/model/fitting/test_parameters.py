@@ -57,3 +57,14 @@ def test_what_is_common_keeps_its_rows_and_moments():
     p.reset_moments(torch.tensor([4]))
     assert len(p["a"]) == 5 and p["all"].shape == (2, 3)
     assert p.moments["a"][0][4] == 0 and (p.moments["all"][0] > 0).all()
+
+
+def test_what_is_replaced_begins_anew():
+    p = Parameters({"a": torch.zeros(3, 2), "b": torch.zeros(4)}, {"a": (0.1, 0.1), "b": (0.1, 0.1)}, common=["b"])
+    (p["a"].sum() + p["b"].sum()).backward()
+    p.step(0.0)
+    p.replace("b", torch.ones(5, 2))
+    assert p["b"].shape == (5, 2) and p["b"].grad is None and all(float(m.abs().max()) == 0 for m in p.moments["b"])
+    p["b"].sum().backward()
+    p.step(0.0)
+    assert float(p["b"].max()) < 1 and torch.equal(p["a"], torch.full((3, 2), -0.1))
