@@ -160,7 +160,7 @@ def test_the_worker_understands_any_name_on_any_console(tmp_path):
         input=json.dumps(request).encode() + b"\n", capture_output=True, env=os.environ | OLD, timeout=120,
     )  # fmt: skip
     events = [json.loads(line.decode("ascii")) for line in done.stdout.splitlines()]
-    assert events[-1]["event"] == "error" and events[-1]["message"].startswith("手: the name must end in")
+    assert events[-1]["event"] == "error" and events[-1]["message"].startswith("手: cannot write that; choose")
 
 
 # ---------------------------------------------------------------- names
