@@ -180,7 +180,7 @@ def _what(rows: Sequence[Row], cost: Cost) -> list[str]:
         ("pictures", f"{sum(row.pictures for row in rows):,}"),
         (f"{what}, an asset", f"{cost.seconds:.1f} on average, {median:.1f} for half of them, {most:.1f} for 95%"),
         (f"pictures a {'second' if clock else 'processor second'}", f"{pictures / max(spent, 1e-9):.2f}"),
-        ("an asset on disk", f"{loose / 1e6:.2f} MB ({_kinds(cost.on_disk)}) in {cost.files:.0f} files"),
+        ("an asset on disk", f"{loose / 1e6:.2f} MB ({_kinds(cost.on_disk, _megabytes)}) in {cost.files:.0f} files"),
         ("packed", f"{packed / 1e6:.2f} MB with passes, {_without_passes(cost) / 1e6:.2f} MB without"),
     ]
     lines = ["| | |", "|---|---|", *(f"| {name} | {text} |" for name, text in table)]
@@ -192,9 +192,13 @@ def _what(rows: Sequence[Row], cost: Cost) -> list[str]:
     return lines
 
 
-def _kinds(sizes: dict[str, float]) -> str:
+def _kinds(sizes: dict[str, float], text: Callable[[float], str]) -> str:
     order = sorted(sizes.items(), key=lambda item: -item[1])
-    return ", ".join(f"{kind} {size / 1e6:.2f}" for kind, size in order)
+    return ", ".join(f"{kind} {text(size)}" for kind, size in order)
+
+
+def _megabytes(size: float) -> str:
+    return f"{size / 1e6:.2f}"
 
 
 def _without_passes(cost: Cost) -> float:
@@ -232,10 +236,11 @@ def _projection(folder: Path, cost: Cost, count: int, mbit: float) -> list[str]:
     loose, packed, bare = sum(cost.on_disk.values()), sum(cost.packed.values()), _without_passes(cost)
     hours = count * cost.seconds / 3600
     shards = -(-count // PackSettings.clips)
+    kinds = _kinds(cost.on_disk, lambda size: _terabytes(count * size))
     table = [
         ("core-hours", f"{hours:,.0f}: {hours / 24 / 64:,.1f} days of 64 cores"),
         ("pictures", f"{count * cost.pictures:,.0f}"),
-        ("as Sequences", f"{_terabytes(count * loose)} ({_kinds_of(cost.on_disk, count)}) in "
+        ("as Sequences", f"{_terabytes(count * loose)} ({kinds}) in "
          f"{count * cost.files:,.0f} files"),
         ("packed with passes", f"{_terabytes(count * packed)} in {shards:,} shards of {PackSettings.clips} clips"),
         ("packed without", _terabytes(count * bare)),
@@ -278,8 +283,3 @@ def _first(folder: Path, cost: Cost, count: int, mbit: float) -> list[str]:
 
 def _terabytes(size: float) -> str:
     return f"{size / 1e12:,.2f} TB" if size >= 1e11 else f"{size / 1e9:,.2f} GB"
-
-
-def _kinds_of(sizes: dict[str, float], count: int) -> str:
-    order = sorted(sizes.items(), key=lambda item: -item[1])
-    return ", ".join(f"{kind} {_terabytes(count * size)}" for kind, size in order)

@@ -4,9 +4,8 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from ..datagen.rigs import Shot, spherical
 from ..datagen.sequence import InputError, Normalisation, focal_from_fov, opengl_to_opencv
 from .gaussians import Gaussians4D
 from .io.asset import SCREEN_BLUR, Asset
-from .io.atomic import atomic_write
+from .io.atomic import atomic_write, new_folder
 from .io.page import FOV, MARGIN, bounds
 from .rasterize.render import render
 from .tracks import Tracks4D
@@ -77,15 +76,14 @@ def placed(shots: list[Shot], asset: Asset) -> list[Shot]:
 def pictures(asset: Asset, shots: list[Shot], look: Look) -> Iterator[np.ndarray]:
     """What each of the shots (normalised space) shows, (height,width,4) uint8: over the background, or with straight
     alpha. Gaussians look as in the pictures that they were fitted to, at whatever size they are drawn."""
-    several = max(torch.get_num_threads(), 1)
+    several, (target, _) = max(torch.get_num_threads(), 1), bounds(asset)
     for first in range(0, len(shots), several):
-        yield from _drawn(asset, shots[first : first + several], look)
+        yield from _drawn(asset, target, shots[first : first + several], look)
 
 
-def _drawn(asset: Asset, shots: list[Shot], look: Look) -> Iterator[np.ndarray]:
+def _drawn(asset: Asset, target: list[float], shots: list[Shot], look: Look) -> Iterator[np.ndarray]:
     clip, longer = asset.clip, max(look.width, look.height)
     c2w = np.stack([opengl_to_opencv(np.asarray(s.c2w, np.float64)) for s in shots])
-    target, _ = bounds(asset)
     away = float(np.median(np.linalg.norm(c2w[:, :3, 3] - target, axis=1)))
     pixel = away * 2 * math.tan(math.radians(shots[0].fov) / 2) / longer  # of the film, at the asset
     samples = min(math.ceil(pixel / clip.pixel - 0.2), MOST_SAMPLES) if clip.pixel else 1
@@ -198,21 +196,11 @@ def _webp(path: Path, look: Look, count: int) -> Iterator[Callable[[np.ndarray],
 
 @contextmanager
 def _png(path: Path, look: Look, count: int) -> Iterator[Callable[[np.ndarray], None]]:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise InputError(f"{path}: it exists already and is not an empty folder; choose another name.")
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as tmp:
-            whole = Path(tmp) / "pictures"
-            whole.mkdir()
+    digits, numbers = max(4, len(str(count))), itertools.count(1)
+    with new_folder(path) as whole:
 
-            def add(picture: np.ndarray) -> None:
-                name = f"{path.name}_{len(list(whole.iterdir())) + 1:0{max(4, len(str(count)))}d}.png"
-                Image.fromarray(picture).save(whole / name, compress_level=4)
+        def add(picture: np.ndarray) -> None:
+            name = f"{path.name}_{next(numbers):0{digits}d}.png"
+            Image.fromarray(picture).save(whole / name, compress_level=4)
 
-            yield add
-            if path.is_dir():
-                path.rmdir()
-            shutil.move(whole, path)
-    except OSError as e:
-        raise InputError(f"{path}: it cannot be written ({e.strerror or e}); choose another place.") from None
+        yield add

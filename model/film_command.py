@@ -37,11 +37,10 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, progress) -> int:
     """0. Raises InputError before anything is drawn."""
-    from .film import SUFFIXES, Look, check_look, placed, turntable, write_film
+    from .film import Look, check_look, placed, turntable, write_film
     from .io.export import read_upright
 
-    if args.out.suffix.lower() not in SUFFIXES:
-        check_look(args.out, Look())
+    check_look(args.out, Look())  # its suffix, before the asset is read
     if args.plays is not None and (args.camera or args.plays < 1):
         raise InputError("video: --plays is for the turntable, and 1 or more; drop it.")
     asset = read_upright(args.asset, args.up)

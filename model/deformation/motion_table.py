@@ -74,9 +74,9 @@ class MotionTable:
         """t (T,) -> how much each moment counts then (T,M+S), in all 1 of either part."""
         apart = float(self.moments[1] - self.moments[0])
         shares = []
-        for moments, width in ((self.moments, self.width), (self.slow, SLOW)):
+        for moments, width in ((self.moments, self.width), (self.slow, SLOW))[: 1 + bool(len(self.slow))]:
             share = torch.exp(-0.5 * ((t[:, None] - moments) / (width * apart)).square())
-            share = share * (share > 1e-3 * share.amax(1, keepdim=True)) if len(moments) else share  # of many, a few
+            share = share * (share > 1e-3 * share.amax(1, keepdim=True))  # of many, a few
             shares.append(share / share.sum(1, keepdim=True))
         return torch.cat(shares, 1)
 

@@ -5,8 +5,6 @@ numpy and the standard library only, for inside Blender.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,7 +12,7 @@ import numpy as np
 
 from ...datagen.sequence import InputError
 from .asset import VISIBLE, Asset, check, static_asset
-from .atomic import atomic_write
+from .atomic import atomic_write, new_folder
 from .placement import rotate_quaternions
 from .slice_formats import SLICE_FORMATS
 
@@ -81,19 +79,8 @@ def write_moments(
     the folder exists and is not empty."""
     folder, count = Path(folder), 0
     encode = _encoder(folder / f"{stem}_0001{suffix}", suffix)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"{folder}: it exists already and is not an empty folder; choose another name.")
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as tmp:
-            whole = Path(tmp) / "frames"
-            whole.mkdir()
-            for frame, asset in moments:
-                count += 1
-                (whole / f"{stem}_{frame:04d}{suffix}").write_bytes(encode(slice_at(asset, frame, cut), frame))
-            if folder.is_dir():
-                folder.rmdir()
-            shutil.move(whole, folder)
-    except OSError as e:
-        raise InputError(f"{folder}: it cannot be written ({e.strerror or e}); choose another place.") from None
+    with new_folder(folder) as whole:
+        for frame, asset in moments:
+            count += 1
+            (whole / f"{stem}_{frame:04d}{suffix}").write_bytes(encode(slice_at(asset, frame, cut), frame))
     return count
