@@ -10,11 +10,10 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 from . import __version__
-from .datagen.sequence import InputError
 from .exit_codes import NOBODY_READS, exit_code
 
 EPILOG = """the road, step by step:
@@ -217,92 +216,18 @@ def train(args: argparse.Namespace) -> int:
 
 
 def reconstruct_arguments(p: argparse.ArgumentParser) -> None:
-    from .model.fitting.quality import QUALITIES
+    from .model.reconstruct_command import add_arguments
 
-    meanings = "; ".join(f"{n}: {q.size} pixels, {q.steps:,} steps, {q.gaussians:,}" for n, q in QUALITIES.items())
-    from .datagen.readers import LAYOUTS
-    from .datagen.readers.options import add_arguments
-
-    p.add_argument("sequence", type=Path, help=f"folder that `timesplat render` wrote, or one of {LAYOUTS}")
-    p.add_argument("--out", type=Path, required=True, help=".ply to write")
     add_arguments(p)
-    p.add_argument("--method", help="tracks, lift, guided, deform, rgb, sweep, predicted, 4dgs (default: tracks "
-                   "where there are surface tracks, else guided where there is depth, else deform)")  # fmt: skip
-    p.add_argument("--quality", help="how much is fitted, and the same comes out however busy the machine is: the "
-                   "longest side of the pictures, steps, most Gaussians. The pictures are averaged down by a whole "
-                   "factor; a method that gains nothing from so many steps or Gaussians takes fewer; one that does not "
-                   f"fit is refined. {meanings}. (default: for deform balanced, else none)")  # fmt: skip
-    p.add_argument("--steps", type=int, help="exactly so many steps of the method's own fit, or of refinement where it "
-                   "has none; in place of --quality")  # fmt: skip
-    p.add_argument("--seconds", type=float, help="for methods that fit the scene: tracks, deform, 4dgs; as many "
-                   "steps are planned as fit (default: 10)")  # fmt: skip
-    p.add_argument("--refine", type=float, default=0.0, help="seconds of fitting the result to the views (default: 0)")
-    p.add_argument("--seed", type=int, default=0, help="of all that is random in fits (default: 0)")
-    p.add_argument("--budget", help="most Gaussians: a number, a share of those predicted such as 10%%, or auto: as "
-                   "many as the scene needs; fits them for --refine seconds, or 5")  # fmt: skip
-    p.add_argument("--max-loss", type=float, default=0.1, help="dB that --budget auto may lose (default: 0.1)")
-    p.add_argument("--size", type=int, metavar="PIXELS", help="read the pictures at this size of their longer side, a "
-                   "whole fraction of theirs (default: theirs)")  # fmt: skip
-    p.add_argument("--rig", help="use only the views of this rig")
-    p.add_argument("--checkpoint", type=Path, help="weights in place of the shipped ones")
-    p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
 
 
 def reconstruct(args: argparse.Namespace) -> int:
     """Reconstruct a Sequence as one 4D Gaussian asset (.ply)."""
-    import time
-
-    from .datagen.readers import open_sequence
-    from .datagen.readers.options import from_arguments
-    from .evaluation.protocol import all_inputs
     from .model import baselines  # noqa: F401, adds its methods
-    from .model.clip import clip_of
-    from .model.geometry.coverage import coverage
-    from .model.io.ply import write_ply
-    from .model.methods import ReconstructOptions, method_named
-    from .model.reconstruct import DEFAULTS, chosen_method, untracked_note
-    from .model.reconstruct import reconstruct as run
-    from .model.views import load_views
+    from .model.reconstruct_command import run
 
-    start = time.perf_counter()
-    if args.seconds is not None and (args.quality or args.steps is not None):
-        other = "--quality" if args.quality else "--steps"
-        raise InputError(f"--seconds and {other}: each says how long a fit goes on; give one of them.")
-    options = ReconstructOptions(
-        device=args.device,
-        checkpoint=args.checkpoint,
-        seconds=DEFAULTS.seconds if args.seconds is None else args.seconds,
-        refine=args.refine,
-        quality=args.quality,
-        steps=args.steps,
-        seed=args.seed,
-        budget=args.budget,
-        max_loss=args.max_loss,
-    )
-    seq = open_sequence(args.sequence, from_arguments(args))
-    if "read" in seq.provenance:  # of others' data, in two lines; `inspect` says more
-        from .datagen.inspection import counts
-
-        print(counts(seq))
-        print("; ".join(seq.provenance["read"][1:]))
-    rigs = sorted({v.rig for v in seq.views})
-    if args.rig and args.rig not in rigs:
-        raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
-    indices = seq.select(rig=args.rig) if args.rig else all_inputs(seq)
-    method = method_named(chosen_method(seq, args.method, indices))
-    if args.seconds is None and not (args.refine or options.counted):
-        options = replace(options, quality=method.quality)
     with _bar() as progress:
-        g = run(seq, method.name, indices, options, progress, size=args.size)
-    write_ply(args.out, g.to_asset(clip_of(seq)))
-    taken = time.perf_counter() - start
-    print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")
-    if method.has_depth and (note := untracked_note(seq)):
-        print(note)
-    if method.knows_surface and not (args.refine or args.budget or options.counted):
-        share, _ = coverage(g, load_views(seq, indices, method.has_depth, args.size))
-        print(f"coverage {share:.0%}" + ("" if share > 0.99 else ": what no camera saw is left open"))
-    return 0
+        return run(args, progress)
 
 
 @contextmanager

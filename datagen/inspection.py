@@ -14,7 +14,7 @@ import numpy as np
 
 from .readers import arranged, volume
 from .readers.options import AXES, ReadOptions
-from .readers.placing import HELD_OUT, looked_at, shows_object, silhouettes_of, small_masks
+from .readers.placing import looked_at, shows_object, silhouettes_of, small_masks
 from .sequence import InputError, Sequence, opengl_to_opencv
 
 FITS = 0.6  # the least share of the silhouettes that fit together where cameras are right
@@ -73,7 +73,7 @@ def inspect(folder: Path, options: ReadOptions) -> Inspection:
 
 def counts(seq: Sequence) -> str:
     """How many pictures, cameras and moments there are, of which size and rate."""
-    inputs = [v for v in seq.views if v.rig not in HELD_OUT]
+    inputs = [v for v in seq.views if not v.held_out]
     moments = len({v.frame for v in seq.views})
     held = len(seq.views) - len(inputs)
     clip = f"{moments} moments, {seq.fps:g} a second" if moments > 1 else "1 moment"
@@ -146,7 +146,7 @@ def coverage(seq: Sequence) -> float:
     z = 1 - 2 * (np.arange(n) + 0.5) / n
     angle = np.pi * (3 - 5**0.5) * np.arange(n)
     sides = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], -1)
-    place = np.array([v.c2w[:3, 3] for v in seq.views if v.rig not in HELD_OUT]).reshape(-1, 3)
+    place = np.array([v.c2w[:3, 3] for v in seq.views if not v.held_out]).reshape(-1, 3)
     middle = np.mean(np.array(seq.aabb, float), 0)
     direction = place - middle
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
@@ -167,7 +167,7 @@ def repeated(seq: Sequence) -> list[str]:
 
 def gaps(seq: Sequence) -> list[str]:
     """Times at which no camera looked, where that is much longer than elsewhere."""
-    moments = np.unique([v.frame for v in seq.views if v.rig not in HELD_OUT])
+    moments = np.unique([v.frame for v in seq.views if not v.held_out])
     if len(moments) < 3:
         return []
     steps = np.diff(moments)
@@ -199,7 +199,7 @@ def light(seq: Sequence) -> list[str]:
     """Pictures that are much brighter or darker than others of their camera, and blurred ones; of some cameras."""
     by_camera: dict[str, list[int]] = {}
     for i, v in enumerate(seq.views):
-        if v.rig not in HELD_OUT:
+        if not v.held_out:
             by_camera.setdefault(v.camera, []).append(i)
     if all(len(x) < EACH for x in by_camera.values()):  # one that is carried around
         groups = [_spread([i for x in by_camera.values() for i in x], CAMERAS * EACH)]

@@ -30,6 +30,7 @@ from .track_file import SurfaceTracks, read_tracks
 from .whole_folders import whole_folder
 
 FORMAT = "timesplat-sequence-1"
+HELD_OUT = {"val": "val", "test": "target"}  # splits whose views are no inputs, by the rig that says so
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,11 @@ class View:
     cy: float
     image: str = ""  # path below the Sequence's folder: RGBA, straight alpha, sRGB, 8 bit
     passes: str | None = None  # EXR with depth and motion vectors, or None
+
+    @property
+    def held_out(self) -> bool:
+        """Whether it is for scoring alone, so that nothing may be learnt from it."""
+        return self.rig in HELD_OUT.values()
 
 
 @dataclass
@@ -130,6 +136,13 @@ class Sequence:
             and (rig is None or v.rig == rig)
             and (frame is None or v.frame == frame)
         ]
+
+    def inputs(self) -> list[int]:
+        """All views that are not held out, in the order of `views`. Raises InputError where there are none."""
+        found = [i for i, v in enumerate(self.views) if not v.held_out]
+        if not found:
+            raise InputError(f"{self.root}: all of its views are held out; render some more.")
+        return found
 
     def load_image(self, index: int) -> np.ndarray:
         """(H,W,4) uint8 RGBA, straight alpha, sRGB-encoded. Raises InputError naming the file."""

@@ -285,7 +285,7 @@ def score(ready: list[Run], options: AblationOptions) -> dict[str, Scores]:
         shrink = int({**BASE, **r.options}["--shrink"])
         for spec in (parse_spec(f"{r.name}={method}@{weights_of(r, options)}"), parse_spec("white")):
             for name, seq in held_out.items():
-                views = (tuple(protocol.all_inputs(seq)), tuple(protocol.held_out(seq)))
+                views = (tuple(seq.inputs()), tuple(protocol.held_out(seq)))
                 runs.append(runner.Run(name, seq.folder, spec, *views, seq.width // shrink))
                 at.append((r.name, spec.label))
     conditions = runner.Conditions(left_out=tuple(k for k in METRICS if k not in ("psnr", "psnr_fg")), one_thread=True)

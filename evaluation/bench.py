@@ -269,7 +269,7 @@ def _has(seq: Sequence, setup: str) -> bool:
 def _inputs(seq: Sequence, setup: str) -> list[int]:
     from . import protocol
 
-    return protocol.inputs(seq, setup) if setup else protocol.all_inputs(seq)
+    return protocol.inputs(seq, setup) if setup else seq.inputs()
 
 
 def runs_of(sequences: dict[str, Sequence], points: list[Point], axes: Axes = AXES) -> list:

@@ -66,7 +66,7 @@ def demo(options: DemoOptions, save_blend: Callable[[Path, Path], None]) -> int:
         seq = render_shots(options.asset or f"zoo:{DEMO_SEED}", out / "render", "demo", settings, progress=progress)
     seconds = {"rendering": time.perf_counter() - clock}
     targets, turn = protocol.held_out(seq), seq.select(rig="turntable")
-    inputs = [i for i in protocol.all_inputs(seq) if seq.views[i].rig != "turntable"]
+    inputs = [i for i in seq.inputs() if seq.views[i].rig != "turntable"]
     print(f"{len(inputs)} input views, {len(targets)} held-out views, {len(turn)} turntable views")
 
     name, cache, conditions = str(seq.provenance.get("asset", "demo")), Cache(out / "cache"), Conditions(scenes=True)

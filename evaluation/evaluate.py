@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ..datagen.readers import DEFAULTS, ReadOptions
 from ..datagen.readers.options import add_arguments as add_reading
 from ..datagen.rigs import SETUPS
-from ..datagen.sequence import InputError, Sequence
+from ..datagen.sequence import HELD_OUT, InputError, Sequence
 from . import protocol
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--setup", default=d.setup, help="comma-separated: alternating, interpolation, rotating, "
                    "random (all: these four), video, canonical, random-N, views-N, split: all views but those held "
                    "out, scored on those of --split (default: %(default)s)")  # fmt: skip
-    p.add_argument("--split", choices=list(protocol.SPLITS), default=d.split, help="for --setup split, which held-out "
+    p.add_argument("--split", choices=list(HELD_OUT), default=d.split, help="for --setup split, which held-out "
                    "views are scored: those of rig target, or of rig val (default: %(default)s)")  # fmt: skip
     p.add_argument("--size", default=d.size, help="comma-separated pixels, multiples of 8 (default: %(default)s); "
                    "rendered at the largest, the others are whole fractions of it")  # fmt: skip
@@ -142,7 +142,7 @@ def plan(
     runs = []
     for setup in setups:
         for name, seq in sequences.items():
-            inputs = protocol.inputs(seq, setup) if setup else protocol.all_inputs(seq)
+            inputs = protocol.inputs(seq, setup) if setup else seq.inputs()
             for size, stride in sizes.items():
                 scored = protocol.held_out(seq, split) if setup == "split" else protocol.targets(seq)
                 targets = [i for i in scored if protocol.is_scored(seq, i, stride)]

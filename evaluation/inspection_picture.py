@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from ..datagen.inspection import up_axis
-from ..datagen.readers.placing import HELD_OUT
 from ..datagen.sequence import Sequence
 from ..datagen.whole_folders import write_whole
 from .figures import COLOURS
@@ -80,7 +79,7 @@ def draw_cameras(axes, seq: Sequence, across: int, up: int) -> None:
     place = np.array([v.c2w[:3, 3] for v in seq.views])
     look = np.array([-v.c2w[:3, 2] for v in seq.views])
     length = 0.25 * float(np.median(np.linalg.norm(place - place.mean(0), axis=1))) or 1.0
-    held = np.array([v.rig in HELD_OUT for v in seq.views])
+    held = np.array([v.held_out for v in seq.views])
     for mask, colour, label in ((~held, COLOURS[0], "cameras"), (held, COLOURS[1], "held out")):
         if mask.any():
             p, d = place[mask][:, [across, up]], length * look[mask][:, [across, up]]

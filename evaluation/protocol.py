@@ -18,13 +18,12 @@ import re
 import numpy as np
 
 from ..datagen import rigs
-from ..datagen.sequence import InputError, Sequence
+from ..datagen.sequence import HELD_OUT, InputError, Sequence
 
 TABLE = ("alternating", "interpolation", "rotating", "random")  # the columns of the paper's two main tables
 FIXED = (*TABLE, "video", "canonical", "split")
 FORMS = f"{', '.join(FIXED)}, random-N (N of 1 to 4 a frame) or views-N (N of 1 to 4 times the frames, in all)"
 RENDER = "render it with `timesplat render --rig evaluation --targets 1`"
-SPLITS = {"test": "target", "val": "val"}  # what is held out of a Sequence, by its rig
 EXACT = 1e-4  # cameras closer than this are the same
 
 
@@ -42,7 +41,7 @@ def inputs(seq: Sequence, setup: str) -> list[int]:
     Raises InputError for an unknown setup, or where the Sequence lacks a view of it."""
     check_setup(setup)
     if setup == "split":
-        return all_inputs(seq)
+        return seq.inputs()
     frames = range(seq.frame_start, seq.frame_end + 1)
     if own := seq.select(rig=setup):  # rendered for this setup
         whole = setup != "random" or len({v.camera for v in seq.views if v.rig == "random"}) == 1
@@ -69,19 +68,11 @@ def inputs(seq: Sequence, setup: str) -> list[int]:
     return [place[w] for w in wanted]
 
 
-def all_inputs(seq: Sequence) -> list[int]:
-    """All views that are not held out. Raises InputError where there are none."""
-    found = [i for i, v in enumerate(seq.views) if v.rig not in SPLITS.values()]
-    if not found:
-        raise InputError(f"{seq.root}: all of its views are held out; render some more.")
-    return found
-
-
 def held_out(seq: Sequence, split: str = "test") -> list[int]:
-    """The held-out views of a split of SPLITS. Raises InputError where there are none."""
-    found = seq.select(rig=SPLITS[split])
+    """The held-out views of a split of HELD_OUT. Raises InputError where there are none."""
+    found = seq.select(rig=HELD_OUT[split])
     if not found:
-        raise InputError(f"{seq.root}: no held-out views to score (rig {SPLITS[split]}); {RENDER}.")
+        raise InputError(f"{seq.root}: no held-out views to score (rig {HELD_OUT[split]}); {RENDER}.")
     return found
 
 

@@ -52,7 +52,7 @@ def part_of(seq: Sequence, count: int) -> list[int]:
     """`count` of the views that are not held out, evenly over the frames: in rounds, each of which takes one of every
     frame, at random but always the same. Raises InputError where there are fewer."""
     rng, at = np.random.default_rng(0), dict[float, list[int]]()
-    for i in protocol.all_inputs(seq):
+    for i in seq.inputs():
         at.setdefault(seq.views[i].frame, []).append(i)
     order = [list(rng.permutation(at[f])) for f in sorted(at)]
     rounds = [[int(views[k]) for views in order if k < len(views)] for k in range(max(map(len, order)))]

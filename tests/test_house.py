@@ -33,6 +33,7 @@ LAYERS = {
         ("model.deformation",),
         ("model.methods",),
         ("model.reconstruct",),
+        ("model.reconstruct_command",),
         ("model.selftest",),
         ("model.worker",),
     ),
@@ -103,8 +104,10 @@ LAYERS = {
 MODEL_READS = {
     "datagen.curation.decisions",
     "datagen.curation.measures",
+    "datagen.inspection",
     "datagen.passes",
     "datagen.readers",
+    "datagen.readers.options",
     "datagen.rigs",
     "datagen.sequence",
     "datagen.shards",

@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..sequence import (
+    HELD_OUT,
     InputError,
     Normalisation,
     Sequence,
@@ -29,7 +30,7 @@ from .options import AXES, ReadOptions
 from .pictures import Pictures, Source, background_of, size_of
 from .volume import normalisation_of_views
 
-SPLITS = {"train": "train", "val": "val", "test": "target"}  # the rig of each
+SPLITS = {"train": "train"} | HELD_OUT  # the rig of each
 FPS = 24.0  # the format has no rate
 SUFFIXES = ("", ".png")  # that are tried, in this order
 REMEDY = "correct it, or get the data set again"

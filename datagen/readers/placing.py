@@ -13,7 +13,6 @@ from . import volume
 from .options import ReadOptions
 from .pictures import Pictures
 
-HELD_OUT = ("val", "target")  # rigs that show what nothing may be learnt from
 UNIT = [[-1, -1, -1], [1, 1, 1]]
 DOUBTFUL = 0.7  # the least share of the silhouettes that should fit together
 
@@ -42,7 +41,7 @@ def shows_object(seq: Sequence) -> bool:
 
 def looked_at(seq: Sequence) -> tuple[list[int], NDArray[np.integer]]:
     """Views that are not held out, spread over the clip, and the window of time that each is of (V,)."""
-    inputs = [i for i, v in enumerate(seq.views) if v.rig not in HELD_OUT] or list(range(len(seq.views)))
+    inputs = [i for i, v in enumerate(seq.views) if not v.held_out] or list(range(len(seq.views)))
     windows = volume.chosen_views(np.array([seq.views[i].frame for i in inputs]))
     number = np.repeat(np.arange(len(windows)), [len(w) for w in windows])
     return [inputs[k] for window in windows for k in window], number

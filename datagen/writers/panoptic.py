@@ -13,10 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ..sequence import Sequence, opengl_to_opencv
-from .pictures import SPLITS, Progress, camera_names
+from .pictures import Progress, camera_names
 from .points import start_points
-
-HELD_OUT = [rig for rig in SPLITS.values() if rig]
 
 
 def write_panoptic(seq: Sequence, folder: Path, progress: Progress) -> None:
@@ -24,7 +22,7 @@ def write_panoptic(seq: Sequence, folder: Path, progress: Progress) -> None:
     from PIL import Image
 
     moments = {f: n for n, f in enumerate(sorted({v.frame for v in seq.views}))}
-    who = [(v.rig in HELD_OUT, name) for v, name in zip(seq.views, camera_names(seq), strict=True)]
+    who = [(v.held_out, name) for v, name in zip(seq.views, camera_names(seq), strict=True)]
     cameras = {w: n for n, w in enumerate(dict.fromkeys(who))}
     files: dict[str, dict] = {}
     for name in ("train_meta.json", "test_meta.json"):

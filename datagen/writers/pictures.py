@@ -14,18 +14,17 @@ import numpy as np
 
 from ..image_files import write_png
 from ..readers.lenses import Taps, sample
-from ..sequence import Sequence, View
+from ..sequence import HELD_OUT, Sequence, View
 
 Progress = Callable[[float, str], None]
-SPLITS = {"train": None, "val": "val", "test": "target"}  # the rig of each; None: all that are not held out
 EACH = 8  # where nothing is held out, each so many-th view is listed for testing, and stays in training
 
 
 def splits_of(seq: Sequence) -> dict[str, list[int]]:
     """The views of train, val and test, none of which is empty, for parsers open all three: where val or test lack,
     it is the other, and without both some of train."""
-    held = {name: seq.select(rig=rig) for name, rig in SPLITS.items() if rig}
-    train = [i for i, v in enumerate(seq.views) if v.rig not in SPLITS.values()] or list(range(len(seq.views)))
+    held = {split: seq.select(rig=rig) for split, rig in HELD_OUT.items()}
+    train = [i for i, v in enumerate(seq.views) if not v.held_out] or list(range(len(seq.views)))
     val, test = held["val"] or held["test"] or train[::EACH], held["test"] or held["val"] or train[::EACH]
     return {"train": train, "val": val, "test": test}
 

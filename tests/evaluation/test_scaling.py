@@ -15,14 +15,12 @@ def clip(frames=6, each=4):
     views = [
         SimpleNamespace(frame=f, rig="target" if k == each else "x") for f in range(frames) for k in range(each + 1)
     ]
-    return SimpleNamespace(
-        views=views, root="clip", select=lambda rig: [i for i, v in enumerate(views) if v.rig == rig]
-    )
+    inputs = [i for i, v in enumerate(views) if v.rig == "x"]
+    return SimpleNamespace(views=views, root="clip", inputs=lambda: inputs)
 
 
-def test_parts_are_even_over_the_frames_and_within_one_another(monkeypatch):
+def test_parts_are_even_over_the_frames_and_within_one_another():
     seq = clip()
-    monkeypatch.setattr(scaling.protocol, "all_inputs", lambda s: [i for i, v in enumerate(s.views) if v.rig == "x"])
     parts = {n: part_of(seq, n) for n in (3, 6, 9, 12, 24)}
     for n, part in parts.items():
         counts = [sum(seq.views[i].frame == f for i in part) for f in range(6)]
