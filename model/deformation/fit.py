@@ -3,9 +3,10 @@
 share, moved by control points (SC-GS, Huang et al. 2024), and both fitted to the photographs, with nothing else known.
 
 Where things move fast, what a view shows is far from where it was in the views that are known, and no gradient leads
-there. So a fit begins in the middle of the clip and goes on to its ends; motion is a table of several levels
-(`motion_table.py`), smooth in time until all of the clip is looked at, then sharper and with places chosen anew,
-among what has been found; pictures are small at first; and neighbours are held together less and less.
+there. So a fit begins in the middle of the clip and goes on to its ends, each moment from where those before it lead;
+motion is a table of several levels (`motion_table.py`), smooth in time until all of the clip is looked at, then
+sharper and with places chosen anew, among what has been found; pictures are small at first; and neighbours are held
+together less and less.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from torch import Tensor
 
 from ..fitting.budget import parse_budget
 from ..fitting.densify import OUTSIDE, Densifier, Pace
-from ..fitting.fit_views import detached, reduction
-from ..fitting.loop import Pyramid, Schedule, Step, gradients, optimise, photometric_loss, warm_up
+from ..fitting.fit_views import detached, downsampled, reduction
+from ..fitting.loop import Pyramid, Schedule, Step, draw, gradients, optimise, photometric_loss, warm_up
 from ..fitting.parameters import Parameters
 from ..fitting.quality import Quality
 from ..fitting.refine import part
@@ -65,6 +66,7 @@ class DeformFit:
 FIT = DeformFit()
 ALONE = replace(FIT, motion=(0.05, 0.0036), bending=(0.05, 0.01))  # where a time is seen by fewer than SEVERAL views
 SMALLEST = 128  # pixels of the longest side, from which pictures grow to what they are
+SPEEDS = 0.5, 1.0  # of those that motion has at a moment, at which it may go on to the next
 SHARES = {1: (0.6,), 2: (0.6, 0.85), 3: (0.5, 0.8, 0.93)}  # of the schedule after which they do, by how often
 
 
@@ -101,7 +103,7 @@ class _Fit:
         fit = self.fit = FIT if self.several else ALONE
         self.views, self.pixel = views, pixel_size(views)
         self.pyramid = pyramid_of(max(views.size))
-        smaller = reduction(views, self.pyramid[0][1])
+        smaller = self.smaller = reduction(views, self.pyramid[0][1])
         self.stages = _stages(self.pyramid, views, max_gaussians)
         self.stage = self.stages[0]
         self.generator = torch.Generator().manual_seed(seed)
@@ -120,6 +122,8 @@ class _Fit:
         values = self._start(xyz, rgb) | {"motion": self.table.zeros()}
         self.parameters = Parameters(values, rates, common=["motion"])
         self.densifier = self._densifier()
+        self.half = self._half(0.0)  # how far from the middle the fit has come, and moments beyond it
+        self.beyond = int((self.table.moments > self.half).sum()) + 1
         self._place()
         self._bind()
 
@@ -143,6 +147,37 @@ class _Fit:
 
     def _place(self) -> None:
         self.control = ControlPoints.among(self._found(), self.table, self.generator)
+
+    def _half(self, fraction: float) -> float:
+        """How far from the middle of the clip the fit has come, in model time."""
+        return max(self.fit.margin * self.views.frame_step, fraction / self.fit.window) + 1e-6
+
+    @torch.no_grad()
+    def _carry_on(self, fraction: float) -> None:
+        """Each time that the fit comes to a further moment at either end: motion beyond it stays as it is, or goes on
+        as before at one of SPEEDS, whichever is most like the views there. What moves fast is then near where it will
+        be looked for. With several views a moment nothing is gained."""
+        half, table = self._half(fraction), self.table
+        beyond = int((table.moments > half).sum()) + 1
+        if self.several or beyond >= self.beyond or len(table.moments) < 2 * beyond + 3:
+            return
+        time, values = self.views.time, self.parameters["motion"].detach()
+        for back, away in ((False, time), (True, -time)):
+            new = ((away > self.half) & (away <= half)).nonzero()[:, 0]
+            if len(new):
+                views, before = downsampled(self.views[new], self.smaller), values.clone()
+                best = self._error(views), before
+                for speed in SPEEDS:
+                    values.copy_(before)
+                    table.carry_on(values, beyond, back, speed)
+                    best = min(best, (self._error(views), values.clone()), key=lambda x: x[0])
+                values.copy_(best[1])
+        self.half, self.beyond = half, beyond
+
+    def _error(self, views: Views) -> float:
+        """How far the cloud as it is now is from the views, over grey."""
+        grey = torch.full((3,), 0.5)
+        return float(photometric_loss(draw(self.cloud(), views, grey, 0.0)))
 
     def _sharpen(self) -> None:
         """Once all of the clip is looked at: moments count over a shorter time, and places, which were among what the
@@ -182,12 +217,11 @@ class _Fit:
         f, views = self.fit, self.views
         if fraction >= f.window:
             return None
-        far, margin = views.time.abs(), f.margin * views.frame_step
-        half = max(margin, fraction / f.window)
-        known = (far <= half + 1e-6).nonzero()[:, 0]
+        far, half = views.time.abs(), self._half(fraction)
+        known = (far <= half).nonzero()[:, 0]
         if not len(known):
             return None
-        last = known[far[known] > half - margin]
+        last = known[far[known] > half - f.margin * views.frame_step]
         chosen = []
         for _ in range(count):
             old = float(torch.rand((), generator=self.generator)) > f.front or not len(last)
@@ -202,7 +236,9 @@ class _Fit:
         return photometric_loss(step, f.ssim_weight) + a * cloud.opacity.mean() + b * bending
 
     def after_backward(self, number: int, fraction: float) -> None:
-        if fraction >= self.fit.window and self.table.width > SHARP[self.several]:
+        if fraction < self.fit.window:
+            self._carry_on(fraction)
+        elif self.table.width > SHARP[self.several]:
             self._sharpen()
         if self._at(fraction) is not self.stage:
             self.stage = self._at(fraction)

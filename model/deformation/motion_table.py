@@ -89,6 +89,19 @@ class MotionTable:
         self.width = width
 
     @torch.no_grad()
+    def carry_on(self, values: Tensor, beyond: int, back: bool, speed: float) -> None:
+        """Changes values (M+S,P,6) of the last `beyond` moments, or of the first where `back`: all goes straight on
+        there, at `speed` times the velocity of the two moments (of 3 at least) that come to them."""
+        known = values[: len(self.moments)].flip(0) if back else values[: len(self.moments)]
+        last = known[-beyond - 1]
+        steps = torch.arange(1, beyond + 1)[:, None, None]
+        on = last + steps * speed * (last - known[-beyond - 3]) / 2
+        if back:
+            values[:beyond] = on.flip(0)
+        else:
+            values[len(self.moments) - beyond : len(self.moments)] = on
+
+    @torch.no_grad()
     def among(self, values: Tensor, points: Tensor, generator: torch.Generator) -> tuple[MotionTable, Tensor]:
         """A table whose places are among points (N,3), 1 or more, and values with which all of these move about as
         they do with `values` (M+S,P,6): as the finest level has it, to which the others will add."""

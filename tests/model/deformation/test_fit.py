@@ -83,6 +83,28 @@ def test_pictures_double_from_about_128_pixels_to_their_own_size():
     assert [size for _, size in pyramid_of(1024)] == [128, 256, 512] == [size for _, size in pyramid_of(1023)]
 
 
+def test_motion_goes_on_as_the_views_of_a_further_moment_say(monkeypatch):
+    views = seen(0)[list(range(0, 3 * FRAMES, 3))]  # one a moment
+    fit = _Fit(views, 50, seed=0)
+    moments = fit.table.moments
+    values = fit.parameters["motion"].detach()[: len(moments)]
+    right = (0.1 * moments.abs())[:, None, None].expand_as(values)  # away from the middle, to both ends
+    values[:] = torch.where(moments.abs()[:, None, None] > fit.half, 0.0, right)
+    before, last = values.clone(), int((moments <= fit.half).sum()) - 1
+
+    def error(views):
+        """As if the views showed what is right after the middle, and before it that nothing goes on."""
+        late = bool(views.time[0] > 0)
+        return float((values - right)[-4:].abs().sum() if late else (values - before)[:4].abs().sum())
+
+    monkeypatch.setattr(fit, "_error", error)
+    fit._carry_on(0.0)
+    assert torch.equal(values, before), "it has not come further yet"
+    fit._carry_on(fit.fit.window * float(moments[last + 1]) + 1e-4)
+    assert torch.allclose(values[last:], right[last:], atol=1e-6)
+    assert torch.equal(values[: len(moments) - last], before[: len(moments) - last])
+
+
 def test_all_of_a_room_is_reconstructed_far_walls_too():
     """The walls are six times as far as the volume reaches, and nothing moves."""
     views = room(SIZE)

@@ -62,6 +62,22 @@ def test_motion_stays_about_as_it_is_when_moments_count_over_a_shorter_time_and_
     assert peak[0] > 1.5 * peak[1]
 
 
+@pytest.mark.parametrize("several", [True, False])
+def test_beyond_what_is_known_all_goes_straight_on(several):
+    table, _ = a_table(several=several)
+    count, values = len(table.moments), table.zeros()
+    straight = table.moments[:, None, None] * torch.arange(1.0, 7.0) + 0.3 + values[:count]
+    values[:count] = straight
+    values[:4], values[count - 4 : count] = 7.0, 7.0
+    table.carry_on(values, 4, True, 1.0)
+    assert (
+        torch.allclose(values[: count - 4], straight[: count - 4], atol=1e-6) and (values[count - 4 : count] == 7).all()
+    )
+    table.carry_on(values, 4, False, 0.5)
+    slower = (straight[-4:] + straight[-5]) / 2
+    assert torch.allclose(values[count - 4 : count], slower, atol=1e-6) and not values[count:].any()
+
+
 def test_spread_points_lie_apart():
     _, points = a_table()
     g = torch.Generator().manual_seed(1)
