@@ -7,10 +7,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from ...datagen.sequence import InputError
-from ..fitting.budget import HELD_OUT
+from ..fitting.budget import check_loss
 from ..fitting.fit_tracks import fit_tracks
-from ..fitting.fit_views import squared_error, validation_views
+from ..fitting.fit_views import psnr, set_aside, validation_views
 from ..fitting.loop import Schedule
 from ..fitting.merge import contribution
 from ..fitting.refine import part
@@ -27,17 +26,14 @@ def thinned(tracks: Tracks4D, views: Views, max_loss: float, progress=None) -> T
     """The tracks (N,) of a fit to detached views -> as few of them as keep within `max_loss` dB of all, their looks
     fitted anew; to be called inside of `gradients()`. For `progress` see `optimise`. Raises InputError for a loss not
     above 0."""
-    if not max_loss > 0:
-        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
-    held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
-    kept = [i for i in range(len(views)) if i not in held_out] or held_out
-    fitted, unseen, pixel = views[kept], views[held_out], pixel_size(views)
+    check_loss(max_loss)
+    (fitted, unseen), pixel = set_aside(views), pixel_size(views)
     some = fitted[validation_views(fitted, min(LOOKED_AT, len(fitted)))]
 
     def fit(start: Tracks4D, tried: int) -> tuple[Tracks4D, float]:
         told = part(progress, 1 - 0.7**tried, 1 - 0.7 ** (tried + 1))
         done = fit_tracks(start, fitted, Schedule(steps=STEPS, pyramid=()), pixel=pixel, progress=told)
-        return done, -10 * math.log10(max(squared_error(done, unseen), 1e-10))
+        return done, psnr(done, unseen)
 
     best, enough = tracks, None
     for tried in range(64):

@@ -8,7 +8,6 @@ them, until twice as many would not bring the loss that is allowed back, on inpu
 
 from __future__ import annotations
 
-import math
 import re
 
 import torch
@@ -16,7 +15,7 @@ import torch
 from ...datagen.sequence import InputError
 from ..gaussians import Gaussians4D, ReconstructedScene
 from ..views import Views
-from .fit_views import detached, squared_error, validation_views, views_around
+from .fit_views import detached, psnr, set_aside, views_around
 from .loop import Schedule, gradients
 from .merge import contribution
 from .refine import Few, enlargement, fit_few, part, refine
@@ -25,7 +24,6 @@ SECONDS = 5.0  # of fitting, where none are asked for, at 128²; in proportion t
 FIRST_TRY = 500  # Gaussians; then twice as many, and so on
 TRY_SECONDS, TRY_STEPS = 1.5, 150  # of each; the steps where nothing else goes by the clock either
 MIN_CONTRIBUTION = 1.0  # pixels of a Gaussian in all of the pictures from around together: a twentieth have less
-HELD_OUT = 6  # input views
 
 
 def parse_budget(text: str) -> int | float | None:
@@ -39,6 +37,12 @@ def parse_budget(text: str) -> int | float | None:
     if match and not match[2] and value >= 1 and value == int(value):
         return int(value)
     raise InputError(f"{text}: no budget; give a number of Gaussians, a share such as 10%, or auto.")
+
+
+def check_loss(max_loss: float) -> None:
+    """Raises InputError for dB that are not above 0."""
+    if not max_loss > 0:
+        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
 
 
 def apply_budget(
@@ -94,15 +98,13 @@ def find_fewest(
     progress=None,
 ) -> tuple[int, list[tuple[int, float]]]:
     """-> the fewest Gaussians that come within `max_loss` dB of twice as many, after fits of `steps`, or of
-    TRY_SECONDS, on HELD_OUT input views, which are not fitted; and what was tried: (number, PSNR in dB there). Raises
+    TRY_SECONDS, on views set aside; and what was tried: (number, PSNR in dB there). Raises
     InputError for a `max_loss` that is not above 0."""
-    if not max_loss > 0:
-        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
+    check_loss(max_loss)
     with gradients():
         g = start.map(lambda x: x.detach().to(device).clone())
         g, views = g[g.alive()].with_axes(), detached(views, device)
-        held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
-        fitted, unseen = views[[i for i in range(len(views)) if i not in held_out] or held_out], views[held_out]
+        fitted, unseen = set_aside(views)
         extra_views = views_around(g, views) if has_depth else None
         schedule = Schedule(seconds=TRY_SECONDS, steps=steps, pyramid=(), seed=seed)
         tried: list[tuple[int, float]] = []
@@ -111,7 +113,7 @@ def find_fewest(
             told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
             few = Few.of(has_depth)
             _, scene = fit_few(g, number, few, fitted, schedule, extra_views=extra_views, progress=told)
-            tried.append((number, -10 * math.log10(max(squared_error(scene, unseen), 1e-10))))
+            tried.append((number, psnr(scene, unseen)))
             if len(tried) > 1 and tried[-1][1] - tried[-2][1] <= max_loss:
                 return tried[-2][0], tried
             number *= 2

@@ -18,6 +18,7 @@ from ..rasterize import render
 from ..views import Views, pad_to_multiple
 
 VALIDATION_VIEWS = 4
+SET_ASIDE = 6  # views, by which it is known how few Gaussians will do
 AROUND = 96  # pictures of a scene from other sides
 STEEPEST = 58  # degrees of elevation, up and down, of where these are taken
 TENSORS = ("rgb", "alpha", "c2w", "intrinsics", "time")  # of Views, as fits use them
@@ -61,12 +62,24 @@ def validation_views(views: Views, count: int = VALIDATION_VIEWS) -> Tensor:
     return order[[len(views) * (2 * i + 1) // (2 * n) for i in range(n)]]
 
 
+def set_aside(views: Views) -> tuple[Views, Views]:
+    """The views without some of them, spread over the clip, and these: SET_ASIDE, but a quarter at the most, or one;
+    of a single view both are it."""
+    aside = validation_views(views, min(SET_ASIDE, max(len(views) // 4, 1))).tolist()
+    return views[[i for i in range(len(views)) if i not in aside] or aside], views[aside]
+
+
 @torch.no_grad()
 def squared_error(g: Gaussians4D, views: Views) -> float:
     """Mean squared error of the scene's pictures over white, with the paper's inference filters."""
     height, width = views.size
     rgb, _ = render(g, views.c2w, views.intrinsics, views.time, width, height, inference=True)
     return float((rgb - views.over(1.0)).square().mean())
+
+
+def psnr(g: Gaussians4D, views: Views) -> float:
+    """dB of the scene's pictures over white, likewise; 100 at the most."""
+    return -10 * math.log10(max(squared_error(g, views), 1e-10))
 
 
 @torch.no_grad()

@@ -7,10 +7,7 @@ follows from the pixels, or from the budget. They start in the colours seen and 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-import torch
 
 from ...datagen.sequence import InputError
 from ...datagen.track_file import SurfaceTracks
@@ -18,9 +15,9 @@ from ..geometry.motion_tracks import motion_tracks
 from ..geometry.surface_tracks import needed_points, pixel_size, surface_tracks
 from ..tracks import Tracks4D
 from ..views import Views
-from .budget import FIRST_TRY, HELD_OUT, parse_budget
+from .budget import FIRST_TRY, check_loss, parse_budget
 from .fit_tracks import FIT, fit_tracks
-from .fit_views import squared_error, validation_views
+from .fit_views import psnr, set_aside
 from .loop import Schedule, warm_up
 from .quality import Quality
 from .refine import part
@@ -86,19 +83,14 @@ def followed(views: Views) -> SurfaceTracks:
 def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None) -> int:
     """The fewest points with which a short fit comes within `max_loss` dB of one with twice as many, on views that
     neither was fitted to; as many as the pixels need, if fewer do not. Raises InputError for a loss not above 0."""
-    if not max_loss > 0:
-        raise InputError(f"{max_loss:g} dB of loss: give more than 0.")
-    held_out = validation_views(views, min(HELD_OUT, max(len(views) // 4, 1))).tolist()
-    kept = [i for i in range(len(views)) if i not in held_out] or held_out
-    fitted, unseen = views[kept], views[held_out]
+    check_loss(max_loss)
+    fitted, unseen = set_aside(views)
     most, count, tried = needed_points(surface, views), FIRST_TRY, []
     schedule = Schedule(steps=TRY_STEPS, pyramid=())
     while count < most:
         told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
         start = surface_tracks(surface, fitted, count)
-        with torch.no_grad():
-            error = squared_error(fit_tracks(start, fitted, schedule, pixel=pixel_size(views), progress=told), unseen)
-        tried.append(-10 * math.log10(max(error, 1e-10)))
+        tried.append(psnr(fit_tracks(start, fitted, schedule, pixel=pixel_size(views), progress=told), unseen))
         if len(tried) > 1 and tried[-1] - tried[-2] <= max_loss:
             return count // 2
         count *= 2

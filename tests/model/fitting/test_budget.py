@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Budgets: what they say, that they are kept, and that a simple scene gets fewer Gaussians than a rich one."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -63,7 +64,7 @@ def test_the_search_ends_where_twice_as_many_are_no_better(scene, monkeypatch):
     monkeypatch.setattr(budget, "FIRST_TRY", 50)
     monkeypatch.setattr(budget, "fit_few", lambda g, number, *_, **__: (0.0, number))
     found, scenes = [], {"needs": 0.0}
-    monkeypatch.setattr(budget, "squared_error", lambda number, views: 1e-3 + scenes["needs"] / number**2)
+    monkeypatch.setattr(budget, "psnr", lambda number, views: -10 * math.log10(1e-3 + scenes["needs"] / number**2))
     for scenes["needs"] in (1e-9, 1, 100):
         n, tried = find_fewest(start, inputs, 0.1, has_depth=False)
         found.append(n)

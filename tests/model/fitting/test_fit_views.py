@@ -9,7 +9,9 @@ from timesplat.model.fitting.fit_views import (
     detached,
     downsampled,
     joined,
+    psnr,
     reduction,
+    set_aside,
     squared_error,
     validation_views,
     views_around,
@@ -49,6 +51,15 @@ def test_validation_views_are_spread_over_the_clip(inputs):
     assert validation_views(inputs[:3]).tolist() == [0, 1, 2] and validation_views(inputs[:1]).tolist() == [0]
 
 
+def test_a_quarter_of_the_views_is_set_aside_six_at_the_most(inputs):
+    for count, aside in ((24, 6), (12, 3), (4, 1), (2, 1)):
+        kept, held = set_aside(inputs[:count])
+        assert len(held) == aside and len(kept) == count - aside
+        assert torch.equal(torch.cat([kept.time, held.time]).sort().values, inputs.time[:count].sort().values)
+    kept, held = set_aside(inputs[:1])
+    assert len(kept) == len(held) == 1
+
+
 def test_pictures_from_around_are_what_the_gaussians_look_like(inputs):
     g = lift(inputs)
     views = views_around(g, inputs, seed=3, count=5)
@@ -62,6 +73,7 @@ def test_pictures_from_around_are_what_the_gaussians_look_like(inputs):
     )
     assert views_around(g, inputs[[4]], count=3).time.tolist() == [float(inputs.time[4])] * 3
     assert squared_error(g, views) < 1e-6  # over white, as they were drawn
+    assert 60 < psnr(g, views) <= 100 and psnr(g[:0], views) < 30
     torch.testing.assert_close(views.c2w[:, :3, 3].norm(dim=-1), inputs.c2w[:5, :3, 3].norm(dim=-1))
     torch.testing.assert_close(torch.linalg.det(views.c2w[:, :3, :3]), torch.ones(5))
     torch.testing.assert_close(views_around(g, inputs, seed=3, count=5).rgb, views.rgb)
