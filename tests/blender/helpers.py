@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from timesplat.model.io.asset import STATIC_SIGMA_T, Asset, Clip
+from timesplat.model.io.asset import ARRAYS, STATIC_SIGMA_T, Asset, Clip
 from timesplat.model.io.paths import Paths, multiply, rotate
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -135,3 +135,26 @@ def make_tracked(n=300, seed=0, clip=CLIP) -> Asset:
     looks = {k: getattr(make(n, seed), k) for k in ("scale", "rotation", "rgb", "opacity")}
     arrays = {k: a.astype(np.float32) for k, a in (rides | looks).items()}
     return Asset(**arrays, clip=clip, path=path, paths=paths)
+
+
+# An asset as an object, and `save`, which exports it from the File menu.
+EXPORT = """
+import atexit
+part("addon").register()
+atexit.register(part("addon").unregister)  # bpy 4.2 crashes at its end otherwise
+display, sliders, edit, holding = (part(f"addon.asset.{x}") for x in ("display", "sliders", "edit", "asset_object"))
+ply = part("model.io.ply")
+folder = sys.argv[1] + os.sep
+ob = display.add_asset(ply.read_ply(folder + "in.ply"), "Walk. 1", look="Points")
+scene = bpy.context.scene
+def save(name, **options):
+    try:
+        return list(bpy.ops.timesplat.export_asset(filepath=folder + name, **options))
+    except RuntimeError as e:
+        return str(e).strip().removeprefix("Error: ")
+"""
+
+
+def same(got, want, atol=4e-6, rtol=4e-6):
+    for name in ARRAYS:
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=rtol, atol=atol, err_msg=name)
