@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 DEMO_SEED = 1_000_013  # a walking figure; checkpoints are trained on seeds below a million
-METHODS = ("white", "hull", "lift", "guided", "guided+budget:10%", "tracks:5", "deform+steps:600")
-SHOWN = ("lift", "guided+budget:10%", "tracks:5", "deform+steps:600")  # in pictures
+METHODS = ("white", "hull", "lift", "guided", "guided+budget:10%", "tracks:5", "deform+quality:balanced")
+SHOWN = ("lift", "guided+budget:10%", "tracks:5", "deform+quality:balanced")  # in pictures
 EXPORTED = "tracks:5"  # the method whose Gaussians are exported
 
 

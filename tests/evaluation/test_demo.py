@@ -24,7 +24,7 @@ def test_demo_writes_what_it_promises(out):
     metrics = json.loads((out / "metrics.json").read_text())
     assert set(metrics["methods"]) == set(METHODS)
     assert all(set(m) >= KEYS for m in metrics["methods"].values())
-    assert set(metrics["seconds"]) >= {"rendering", "lift", "guided", "deform+steps:600", "export"}
+    assert set(metrics["seconds"]) >= {"rendering", "lift", "guided", "deform+quality:balanced", "export"}
     assert metrics["methods"]["lift"]["psnr"] > metrics["methods"]["hull"]["psnr"]
     assert Image.open(out / "comparison.png").width > 300
     with Image.open(out / "turntable.webp") as film:
