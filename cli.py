@@ -226,8 +226,7 @@ def reconstruct(args: argparse.Namespace) -> int:
     from .model import baselines  # noqa: F401, adds its methods
     from .model.reconstruct_command import run
 
-    with _bar() as progress:
-        return run(args, progress)
+    return run(args, _bar)
 
 
 @contextmanager
@@ -289,8 +288,7 @@ def video(args: argparse.Namespace) -> int:
     with alpha."""
     from .model.film_command import run
 
-    with _bar() as progress:
-        return run(args, progress)
+    return run(args, _bar)
 
 
 # ---------------------------------------------------------------- evaluate, bench, demo

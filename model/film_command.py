@@ -7,6 +7,8 @@ import argparse
 import json
 import math
 import re
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,8 +37,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
                    "as takes four seconds)")  # fmt: skip
 
 
-def run(args: argparse.Namespace, progress) -> int:
-    """0. Raises InputError before anything is drawn."""
+def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Callable[[float, str], None]]]) -> int:
+    """0. `bar` shows how far the film is. Raises InputError before anything is drawn."""
     from .film import Look, check_look, placed, turntable, write_film
     from .io.export import read_upright
 
@@ -54,7 +56,8 @@ def run(args: argparse.Namespace, progress) -> int:
         shots, (width, height) = turntable(asset, fps, args.plays), (look.width, look.height)
     width, height = size(args.size, width, height)
     look = replace(look, width=width, height=height)
-    count = write_film(args.out, asset, shots, look, progress)
+    with bar() as progress:
+        count = write_film(args.out, asset, shots, look, progress)
     print(f"{args.out}: {count} pictures of {width} x {height}, {count / fps:.1f} s")
     return 0
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..datagen.readers import LAYOUTS, open_sequence
 from ..datagen.readers.options import add_arguments as add_reading
@@ -14,8 +17,12 @@ from ..datagen.readers.options import from_arguments
 from ..datagen.sequence import InputError
 from .fitting.quality import QUALITIES
 
+if TYPE_CHECKING:
+    from .methods import Progress
+
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
+    """The arguments of `timesplat reconstruct`."""
     meanings = "; ".join(f"{n}: {q.size} pixels, {q.steps:,} steps, {q.gaussians:,}" for n, q in QUALITIES.items())
     p.add_argument("sequence", type=Path, help=f"folder that `timesplat render` wrote, or one of {LAYOUTS}")
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
@@ -42,8 +49,9 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
 
 
-def run(args: argparse.Namespace, progress) -> int:
-    """0. Raises InputError before anything is written."""
+def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Progress]]) -> int:
+    """0. `bar` shows how far the fit is, and is gone before anything is said of the result. Raises InputError before
+    anything is written."""
     from ..datagen.inspection import counts
     from .clip import clip_of
     from .geometry.coverage import coverage
@@ -78,7 +86,8 @@ def run(args: argparse.Namespace, progress) -> int:
     method = method_named(chosen_method(seq, args.method, indices))
     if args.seconds is None and not (args.refine or options.counted):
         options = replace(options, quality=method.quality)
-    g = reconstruct(seq, method.name, indices, options, progress, size=args.size)
+    with bar() as progress:
+        g = reconstruct(seq, method.name, indices, options, progress, size=args.size)
     write_ply(args.out, g.to_asset(clip_of(seq)))
     taken = time.perf_counter() - start
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")

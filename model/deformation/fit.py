@@ -156,10 +156,10 @@ class _Fit:
     def _carry_on(self, fraction: float) -> None:
         """Each time that the fit comes to a further moment at either end: motion beyond it stays as it is, or goes on
         as before at one of SPEEDS, whichever is most like the views there. What moves fast is then near where it will
-        be looked for. With several views a moment nothing is gained."""
+        be looked for. Where SEVERAL views show a moment nothing is gained by it."""
         half, table = self._half(fraction), self.table
         beyond = int((table.moments > half).sum()) + 1
-        if self.several or beyond >= self.beyond or len(table.moments) < 2 * beyond + 3:
+        if beyond >= self.beyond or len(table.moments) < 2 * beyond + 3:
             return
         time, values = self.views.time, self.parameters["motion"].detach()
         for back, away in ((False, time), (True, -time)):
@@ -237,7 +237,8 @@ class _Fit:
 
     def after_backward(self, number: int, fraction: float) -> None:
         if fraction < self.fit.window:
-            self._carry_on(fraction)
+            if not self.several:
+                self._carry_on(fraction)
         elif self.table.width > SHARP[self.several]:
             self._sharpen()
         if self._at(fraction) is not self.stage:
