@@ -94,6 +94,13 @@ class Gaussians4D:
         cross = (v * s2)[..., None]
         return torch.cat([torch.cat([top, cross], -1), torch.cat([cross.mT, s2[..., None]], -1)], -2)
 
+    def widened(self, by: float) -> Gaussians4D:
+        """Blurred by a standard deviation of `by`, in every direction."""
+        wide = replace(self, scale=(self.scale.square() + by**2).sqrt())
+        if self.cov3 is not None:
+            wide.cov3 = self.cov3 + by**2 * torch.eye(3).to(self.cov3)
+        return wide
+
     def frozen(self, t: float) -> Gaussians4D:
         """The scene as it is at time t, for ever."""
         return Gaussians4D(

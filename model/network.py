@@ -29,6 +29,7 @@ from .gaussians import DynamicScene, Gaussians4D
 from .geometry.features import LAYOUTS, Geometry
 from .layout import Layout
 from .patches import gather_pixels, in_patches, patch_rays, pixel_places
+from .rasterize.constants import WIDER
 from .views import Views, pluecker
 
 PIXEL = Layout({"rgb": 3, "time": 1, "ray": 6})  # input channels: -1..1 over white, -1..1 over the clip, Plücker
@@ -159,6 +160,7 @@ class Network(nn.Module):
             if self.config.free:
                 free = self.config.free_layout.split(self.decode_free(tokens["free"]))
                 scene = Gaussians4D.cat([scene, heads.in_the_box(free)])
+            scene = scene.widened(WIDER * views.pixel)
             if self.config.motion == "hexplane":
                 return hexplane.deformed(scene, self.decode_planes(tokens["planes"]), self.deform)
             return scene

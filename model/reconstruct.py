@@ -86,12 +86,10 @@ def _from_smaller(views: Views, by: int, run: Callable[[Views], Scene]) -> Scene
     """What `run` makes of the views at 1/by of their size, to be drawn at their own."""
     scene = run(shrink(views, by))
     if by > 1 and isinstance(scene, Gaussians4D | Tracks4D):
-        from .geometry.surface_tracks import pixel_size
         from .rasterize.constants import BLUR
 
         # They were fitted as they are drawn in the smaller pictures, blurred by some of the larger pixels.
-        blur = BLUR * (by**2 - 1) * pixel_size(views) ** 2
-        return replace(scene, scale=(scene.scale.square() + blur).sqrt())
+        return scene.widened(math.sqrt(BLUR * (by**2 - 1)) * views.pixel)
     return scene
 
 

@@ -90,6 +90,10 @@ class Tracks4D:
     def to(self, *args, **kwargs) -> Tracks4D:
         return Tracks4D(*(getattr(self, f.name).to(*args, **kwargs) for f in fields(self)))
 
+    def widened(self, by: float) -> Tracks4D:
+        """Blurred by a standard deviation of `by`, in every direction."""
+        return replace(self, scale=(self.scale.square() + by**2).sqrt())
+
     def at(self, t: float) -> Gaussians4D:
         """The Gaussians as they are at time t in [-1,1], for ever; differentiable in the looks, and in the knots' place
         and rotation."""

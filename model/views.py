@@ -47,6 +47,11 @@ class Views:
         """Height, width."""
         return self.rgb.shape[1], self.rgb.shape[2]
 
+    @property
+    def pixel(self) -> float:
+        """The median over the views of a pixel's size at the origin, normalised units."""
+        return float((self.c2w[:, :3, 3].norm(dim=-1) / self.intrinsics[:, 0]).median())
+
     def over(self, background: float | Tensor = BACKGROUND) -> Tensor:
         """(V,H,W,3) the pictures composited over a background (scalar or (3,)), white by default."""
         a = self.alpha[..., None]

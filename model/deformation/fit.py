@@ -25,7 +25,6 @@ from ..fitting.parameters import Parameters
 from ..fitting.quality import Quality
 from ..fitting.refine import part
 from ..geometry.silhouettes import points_inside
-from ..geometry.surface_tracks import pixel_size
 from ..geometry.surroundings import EDGE, is_whole, points_around
 from ..tracks import Tracks4D
 from ..views import Views
@@ -101,7 +100,7 @@ class _Fit:
     def __init__(self, views: Views, max_gaussians: int, seed: int):
         self.several = len(views) >= SEVERAL * len(views.time.unique())
         fit = self.fit = FIT if self.several else ALONE
-        self.views, self.pixel = views, pixel_size(views)
+        self.views, self.pixel = views, views.pixel
         self.pyramid = pyramid_of(max(views.size))
         smaller = self.smaller = reduction(views, self.pyramid[0][1])
         self.stages = _stages(self.pyramid, views, max_gaussians)

@@ -13,7 +13,6 @@ from ..fitting.fit_views import psnr, set_aside, validation_views
 from ..fitting.loop import Schedule
 from ..fitting.merge import contribution
 from ..fitting.refine import part
-from ..geometry.surface_tracks import pixel_size
 from ..tracks import Tracks4D
 from ..views import Views
 
@@ -27,7 +26,7 @@ def thinned(tracks: Tracks4D, views: Views, max_loss: float, progress=None) -> T
     fitted anew; to be called inside of `gradients()`. For `progress` see `optimise`. Raises InputError for a loss not
     above 0."""
     check_loss(max_loss)
-    (fitted, unseen), pixel = set_aside(views), pixel_size(views)
+    (fitted, unseen), pixel = set_aside(views), views.pixel
     some = fitted[validation_views(fitted, min(LOOKED_AT, len(fitted)))]
 
     def fit(start: Tracks4D, tried: int) -> tuple[Tracks4D, float]:

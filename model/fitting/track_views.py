@@ -12,7 +12,7 @@ import numpy as np
 from ...datagen.sequence import InputError
 from ...datagen.track_file import SurfaceTracks
 from ..geometry.motion_tracks import motion_tracks
-from ..geometry.surface_tracks import needed_points, pixel_size, surface_tracks
+from ..geometry.surface_tracks import needed_points, surface_tracks
 from ..tracks import Tracks4D
 from ..views import Views
 from .budget import FIRST_TRY, check_loss, parse_budget
@@ -60,7 +60,7 @@ def reconstruct_tracks(
     schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, pyramid=(), seed=seed)
     told = part(progress, search, 1)
     warm_up("cpu")
-    fitted = fit_tracks(start, views, schedule, pixel=pixel_size(views), progress=told)
+    fitted = fit_tracks(start, views, schedule, pixel=views.pixel, progress=told)
     return fitted if not limit or len(fitted) <= limit else fitted[fitted.opacity.topk(limit).indices]
 
 
@@ -90,7 +90,7 @@ def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None)
     while count < most:
         told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
         start = surface_tracks(surface, fitted, count)
-        tried.append(psnr(fit_tracks(start, fitted, schedule, pixel=pixel_size(views), progress=told), unseen))
+        tried.append(psnr(fit_tracks(start, fitted, schedule, pixel=views.pixel, progress=told), unseen))
         if len(tried) > 1 and tried[-1] - tried[-2] <= max_loss:
             return count // 2
         count *= 2

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians4D
+from ..rasterize.constants import WIDER
 from ..rotations import quaternion_from_matrix
 from ..views import Views, camera_rays
 from .features import LIFT_FEATURES, SCALES, Features, Geometry, scaled_distance
@@ -45,7 +46,7 @@ ALONE = LiftSettings(min_sigma_t=0.3)
 
 def lift(views: Views) -> Gaussians4D:
     """Views with depth and flow -> (M,) Gaussians. CPU tensors."""
-    return lift_geometry(views, ALONE).gaussians
+    return lift_geometry(views, ALONE).gaussians.widened(WIDER * views.pixel)
 
 
 def lift_geometry(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Geometry:

@@ -32,7 +32,7 @@ class TrackSettings:
     least: int = 4000  # points …
     densest: float = 4.0  # … but no more a pixel of surface, or each is so faint that it is left out
     most: int = 100_000
-    footprint: float = 0.35  # σ along the surface, in distances between points
+    footprint: float = 0.65  # σ along the surface, in distances between points
     thickness: float = 0.1  # σ across it, the same
     least_share: float = 0.4  # of what is seen of a point must be seen of a side that has looks of its own
     apart: float = 0.15  # how far above the surface the two sides of a sheet are, in pixels
@@ -46,11 +46,6 @@ SETTINGS = TrackSettings()
 STEEPEST = 0.25  # cosine: what is seen under less is taken to be seen under this
 
 
-def pixel_size(views: Views) -> float:
-    """The median over the views of a pixel's size at the origin, normalised units."""
-    return float((views.c2w[:, :3, 3].norm(dim=-1) / views.intrinsics[:, 0]).median())
-
-
 def needed_points(surface: SurfaceTracks, views: Views, settings: TrackSettings = SETTINGS) -> int:
     """How many points the views' pixels need, of those that there are."""
     pixels = _pixels(surface, views)
@@ -61,7 +56,7 @@ def needed_points(surface: SurfaceTracks, views: Views, settings: TrackSettings 
 
 def _pixels(surface: SurfaceTracks, views: Views) -> float:
     """How many pixels the surface would fill, laid out before the views."""
-    return float(surface.area.sum()) / pixel_size(views) ** 2
+    return float(surface.area.sum()) / views.pixel**2
 
 
 def surface_tracks(
@@ -69,7 +64,7 @@ def surface_tracks(
 ) -> Tracks4D:
     """`count` of the points of `surface`, or as many as the views' pixels need, as tracks on the CPU: one each, and two
     on a sheet that is seen from both sides. The views have depth. None where there are no points."""
-    pixel = pixel_size(views)
+    pixel = views.pixel
     whole = float(surface.area.sum())
     most = max(round(settings.densest * _pixels(surface, views)), 1)
     chosen = min(count or needed_points(surface, views, settings), most, len(surface))

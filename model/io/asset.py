@@ -17,7 +17,7 @@ SH_C0 = 0.28209479177387814  # the constant spherical harmonic: rgb = 0.5 + SH_C
 VISIBLE = 0.05  # opacity below which a Gaussian counts as invisible at a moment (the paper's filter)
 STATIC_SIGMA_T = 1e4  # lifetime of what does not change: exp(-½(2/1e4)²) is 1 in float32
 ONE_FRAME_SIGMA = 1 / 3  # σ_t, in frames, of what shows at one frame: 1.1 % of its opacity is left a frame away
-SCREEN_BLUR = 0.3  # px² that rasterisers of splats add to the covariance on the screen
+SCREEN_BLUR = 0.1  # px² that rasterisers of splats add to the covariance on the screen
 SMALLEST_SCALE = 1e-9  # other programs' splats are at least so large
 FAR = 256  # times its size (or units, what is smaller than one) away from the origin, float32 costs 1e-5 of that
 BRIGHTEST = 1e6  # colours beyond are damage; as coefficients they would be infinite

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians4D
-from .constants import ALPHA_MIN, INFERENCE_MIN, NEAR_PLANE
+from .constants import ALPHA_MIN, BLUR, INFERENCE_MIN, NEAR_PLANE
 from .inputs import Cameras, RenderOptions, check_finite
 
 
@@ -65,6 +65,7 @@ def rasterize(gaussians: Gaussians4D, cameras: Cameras, options: RenderOptions) 
             width=width,
             height=height,
             near_plane=NEAR_PLANE,
+            eps2d=BLUR,
             covars=symmetric[keep].float(),  # (K,3,3)
             backgrounds=background.float()[None],  # (1,3)
             rasterize_mode="classic",

@@ -95,3 +95,16 @@ def test_a_frozen_scene_is_the_slice_at_its_moment_for_ever():
     for t in (-1.0, 0.3, 0.9):
         torch.testing.assert_close(still.position(torch.tensor(t)), g.position(moment))
         torch.testing.assert_close(still.opacity * still.marginal(torch.tensor(t)), g.opacity * g.marginal(moment))
+
+
+def test_widened_adds_the_same_to_every_direction():
+    torch.manual_seed(0)
+    rotation = torch.nn.functional.normalize(torch.randn(5, 4), dim=-1)
+    zero, one = torch.zeros(5), torch.ones(5)
+    g = Gaussians4D(torch.zeros(5, 3), zero, torch.zeros(5, 3), one, torch.rand(5, 3), rotation, torch.zeros(5, 3), one)
+    expected = g.covariance3() + 0.2**2 * torch.eye(3)
+    known = Gaussians4D.from_covariance(g.xyz, g.t, g.velocity, g.sigma_t, g.covariance3(), g.rgb, g.opacity)
+    for wide in (g.widened(0.2), known.widened(0.2), known.widened(0.2).with_axes()):
+        torch.testing.assert_close(wide.covariance3(), expected, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(known.widened(0.2).scale, expected.diagonal(dim1=-2, dim2=-1).sqrt())
+    assert known.cov3 is not None and torch.equal(known.cov3, g.covariance3())

@@ -15,6 +15,7 @@ from timesplat.model.geometry.plane_sweep import sweep_geometry
 from timesplat.model.inference import geometry_for
 from timesplat.model.network import PRESETS, Config, Network, load_matching
 from timesplat.model.patches import gather_pixels
+from timesplat.model.rasterize.constants import WIDER
 from timesplat.model.views import rays
 
 TINY = {"width": 32, "depth": 2, "heads": 2}
@@ -60,7 +61,8 @@ def test_untrained_paper_head_starts_at_the_appendix_biases(views):
     torch.testing.assert_close(g.opacity, torch.full_like(g.opacity, float(torch.sigmoid(torch.tensor(-2.0)))))
     torch.testing.assert_close(g.rgb, torch.full_like(g.rgb, 0.5))
     S = g.covariance4()
-    equal = torch.exp(torch.tensor(-2.3)) ** 2 * torch.eye(4)  # equal scales: any rotation leaves a sphere
+    equal = torch.exp(torch.tensor(-2.3)) ** 2 * torch.eye(4)  # equal scales: any rotation leaves a sphere …
+    equal[:3, :3] += (WIDER * views.pixel) ** 2 * torch.eye(3)  # … blurred as 3DGS's rasteriser does
     torch.testing.assert_close(S, equal.expand_as(S), atol=1e-6, rtol=1e-4)
     distance = (g.xyz - views.c2w[0, :3, 3])[: 32 * 32].norm(dim=-1)
     torch.testing.assert_close(distance, torch.full_like(distance, 2.3), atol=1e-5, rtol=0)
@@ -79,7 +81,7 @@ def test_clamps_hold(views):
     net = Network(Config(**TINY, head="kinematic"))
     net.decode.weight.data *= 1000
     g = net(views)
-    assert g.scale.max() <= 0.3 and g.sigma_t.max() <= 1.0
+    assert g.scale.square().max() <= 0.3**2 + (WIDER * views.pixel) ** 2 + 1e-6 and g.sigma_t.max() <= 1.0
     assert g.xyz.abs().max() <= 1  # in training only
     assert net.eval()(views).xyz.abs().max() > 1
 
@@ -101,7 +103,7 @@ def test_untrained_network_equals_its_geometry(views, source, make):
     net = Network(Config(**TINY, source=source)).eval()
     geometry = make(views)
     g = net(views, geometry)
-    base = geometry.gaussians
+    base = geometry.gaussians.widened(WIDER * views.pixel)
     assert len(g) == len(base) > 0
     for k in ("xyz", "t", "velocity", "sigma_t", "scale", "rotation", "rgb"):
         torch.testing.assert_close(getattr(g, k), getattr(base, k), rtol=0, atol=1e-6)

@@ -4,7 +4,7 @@
 // it): EWA, the covariance on the screen widened by BLUR, drawn from ALPHA_MIN on, blended back to front in sRGB.
 
 const SH_C0 = 0.28209479177387814, SLACK = 1e-4;  // as in model/io/asset.py and paths.py
-const NEAR = 0.01, BLUR = 0.3, SLOPE_MARGIN = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.999;  // model/rasterize/constants.py
+const NEAR = 0.01, BLUR = 0.1, SLOPE_MARGIN = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.999;  // model/rasterize/constants.py
 const TEXELS = 5, WIDTH = 4000; // that a Gaussian takes; in a row of a texture
 const BINS = 1 << 16;  // of depth
 

@@ -12,6 +12,7 @@ from timesplat.evaluation.loading import load_truth
 from timesplat.evaluation.method_spec import parse_spec
 from timesplat.evaluation.scoring import evaluate_views
 from timesplat.model.fitting.fit_views import squared_error
+from timesplat.model.fitting.loop import photometric_loss
 from timesplat.model.fitting.refine import FROM_DEPTH, FROM_RGB, Few, part, refine, start_size
 from timesplat.model.gaussians import Gaussians4D
 from timesplat.model.geometry.lift import lift
@@ -52,7 +53,7 @@ def test_other_views_get_better_by_a_number_of_steps(scene, has_depth):
 def test_what_gets_no_better_stays(scene, monkeypatch):
     inputs, _ = scene
     start = lift(inputs)
-    monkeypatch.setattr("timesplat.model.fitting.refine.photometric_loss", lambda step: 10 * step.alpha.mean())
+    monkeypatch.setattr("timesplat.model.fitting.refine.photometric_loss", lambda step: -photometric_loss(step))
     assert refine(start, inputs, 0, has_depth=True, steps=8) is start
     assert refine(start, inputs, 0.0) is start
     none = replace(start, opacity=0 * start.opacity)

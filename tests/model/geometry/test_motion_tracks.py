@@ -11,7 +11,7 @@ from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import opengl_to_opencv
 from timesplat.datagen.track_file import read_tracks, write_tracks
 from timesplat.model.geometry.motion_tracks import motion_tracks
-from timesplat.model.geometry.surface_tracks import pixel_size, surface_tracks
+from timesplat.model.geometry.surface_tracks import surface_tracks
 from timesplat.model.rotations import rotation_matrix
 from timesplat.model.views import Views, rays
 
@@ -70,14 +70,14 @@ def test_points_go_with_what_they_are_on(spheres, views, tracks):
     place = tracks.position[np.arange(n), middle]
     motion = spheres.truth(place, middle)
     truth = place[:, None] + motion[:, None] * (np.arange(24) - middle[:, None])[..., None]
-    error = np.linalg.norm(tracks.position - truth, axis=-1)[there(tracks)] / pixel_size(views)
+    error = np.linalg.norm(tracks.position - truth, axis=-1)[there(tracks)] / views.pixel
     assert np.median(error) < 0.2 and np.percentile(error, 95) < 1
     assert np.median(tracks.last - tracks.first) > 12
 
 
 def test_one_point_a_pixel_of_surface_and_not_one_a_pixel_of_every_view(views, tracks):
     surface = 4 * np.pi * (0.38**2 + 0.3**2 + 0.25**2)
-    assert 0.5 < len(tracks) / (surface / pixel_size(views) ** 2) < 2.5
+    assert 0.5 < len(tracks) / (surface / views.pixel**2) < 2.5
     assert len(tracks) < 0.25 * float(views.alpha.sum())
 
 
@@ -89,9 +89,9 @@ def test_a_turning_ball():
     middle = (tracks.first + tracks.last) // 2
     turn = torch.stack([turned(TURN * k) for k in range(-23, 24)]).numpy()[np.arange(24) - middle[:, None] + 23]
     truth = (turn @ tracks.position[np.arange(n), middle][:, None, :, None])[..., 0]
-    error = np.linalg.norm(tracks.position - truth, axis=-1)[alive] / pixel_size(views)
+    error = np.linalg.norm(tracks.position - truth, axis=-1)[alive] / views.pixel
     assert np.median(error) < 0.2 and np.percentile(error, 95) < 1
-    off = np.abs(np.linalg.norm(tracks.position, axis=-1) - RADIUS)[alive] / pixel_size(views)
+    off = np.abs(np.linalg.norm(tracks.position, axis=-1) - RADIUS)[alive] / views.pixel
     assert np.percentile(off, 95) < 0.3
     axes = rotation_matrix(torch.from_numpy(tracks.rotation.astype(np.float32))).numpy()
     cosine = (axes[..., 2] * tracks.position / RADIUS).sum(-1)[alive]

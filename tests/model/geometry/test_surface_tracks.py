@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from tests.model import track_scenes as scenes
-from timesplat.model.geometry.surface_tracks import needed_points, pixel_size, surface_tracks
+from timesplat.model.geometry.surface_tracks import needed_points, surface_tracks
 
 
 def test_points_are_where_they_were_and_share_a_path():
     seen = scenes.views()
     tracks = surface_tracks(seen.surface, seen)
-    pixel = pixel_size(seen)
+    pixel = seen.pixel
     assert len(tracks) == len(seen.surface) == 600 and len(tracks.paths) <= 8
     centre, _ = scenes.motion()
     for f in (0, 4, 8):
@@ -69,16 +69,16 @@ def test_as_many_as_pixels_need_or_as_are_wanted():
     seen = scenes.views()
     many = scenes.surface(9000)
     whole = float(many.area.sum())
-    assert needed_points(many, seen) == 4000 > whole / pixel_size(seen) ** 2
+    assert needed_points(many, seen) == 4000 > whole / seen.pixel**2
     assert len(surface_tracks(many, seen, 50)) == 50
     big = replace(seen, intrinsics=seen.intrinsics * 4)
-    assert needed_points(many, big) == min(9000, round(whole / pixel_size(big) ** 2))
+    assert needed_points(many, big) == min(9000, round(whole / big.pixel**2))
 
 
 def test_what_fills_few_pixels_is_kept():
     """Points that lie more densely than pixels share what is seen of them, and what is faint is left out."""
     seen, many = scenes.views(), scenes.surface(9000)
-    pixels = float(many.area.sum()) / pixel_size(seen) ** 2
+    pixels = float(many.area.sum()) / seen.pixel**2
     tracks = surface_tracks(replace(many, area=many.area * np.float32(200 / pixels)), seen, 5000)
     assert 500 < len(tracks) <= 800 and tracks.alive().all()
 

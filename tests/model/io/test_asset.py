@@ -39,7 +39,7 @@ def test_at_is_the_kinematic_form():
 
 def test_softened_is_what_a_blurring_rasteriser_shows():
     a = make_asset(clip=Clip(pixel=0.02))
-    np.testing.assert_allclose(a.soft_scale() ** 2, a.scale**2 + 0.3 * 0.02**2, rtol=1e-5)
+    np.testing.assert_allclose(a.soft_scale() ** 2, a.scale**2 + 0.1 * 0.02**2, rtol=1e-5)
     soft = a.softened()
     np.testing.assert_array_equal(soft.scale, a.soft_scale())
     np.testing.assert_array_equal(soft.scale, soft.soft_scale())
@@ -103,7 +103,7 @@ def test_soft_scales_of_any_size():
         assert np.array_equal(asset.soft_scale(), asset.scale)
     asset = make_asset(2, clip=Clip(pixel=0.01))
     asset.scale[:] = 1e-30
-    assert np.allclose(asset.soft_scale(), np.sqrt(0.3) * 0.01)
+    assert np.allclose(asset.soft_scale(), np.sqrt(0.1) * 0.01)
 
 
 def test_a_colour_beyond_all_bounds_is_damage():

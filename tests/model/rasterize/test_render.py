@@ -7,14 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from timesplat.model.rasterize import render
+from timesplat.model.rasterize import reference, render
+from timesplat.model.rasterize.constants import WIDER
 
 from .scenes import AXIS, FIELDS, cameras, cloud, gaussians, one_of, plane
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_single_gaussian_by_hand(backend):
-    """On the axis at z = 2, isotropic: Σ₂ = (40 · 0.1 / 2)² + 0.3 = 4.3 px², alpha = o · m · exp(-½ d² / 4.3)."""
+    """On the axis at z = 2, isotropic: Σ₂ = (40 · 0.1 / 2)² + 0.1 = 4.1 px², alpha = o · m · exp(-½ d² / 4.1)."""
     colour = torch.tensor([0.9, 0.5, -0.3])
     g = replace(
         plane(1, 2.0),
@@ -28,7 +29,7 @@ def test_single_gaussian_by_hand(backend):
     rgb, alpha = render(g, *AXIS, background=0.25, backend=backend)
     for x, y in ((20, 15), (22, 14), (17, 15)):
         d2 = (x + 0.5 - 20) ** 2 + (y + 0.5 - 15) ** 2
-        a = 0.8 * math.exp(-0.5) * math.exp(-0.5 * d2 / 4.3)
+        a = 0.8 * math.exp(-0.5) * math.exp(-0.5 * d2 / 4.1)
         assert alpha[0, y, x].item() == pytest.approx(a, rel=1e-5)
         torch.testing.assert_close(rgb[0, y, x], a * colour + (1 - a) * 0.25, rtol=1e-5, atol=1e-6)
     assert alpha[0, 0, 0] == 0 and (rgb[0, 0, 0] == 0.25).all()
@@ -140,3 +141,12 @@ def test_what_is_not_the_shape_is_not_looked_at():
     g, view = cloud(20), cameras()
     anything = replace(g, scale=torch.full((20, 3), math.nan), rotation=torch.zeros(20, 4))
     assert torch.equal(render(anything, *view)[0], render(g, *view)[0])
+
+
+def test_wider_is_as_3dgs_draws_it(monkeypatch):
+    """Before the middle of the camera, where a pixel has the size told."""
+    g, pixel = plane(20, 2.0, scale=(0.02, 0.1)), 2.0 / float(AXIS[1][0, 0])
+    g.xyz[:, :2] = 0
+    ours = render(g.widened(WIDER * pixel), *AXIS, backend="reference")[0]
+    monkeypatch.setattr(reference, "BLUR", 0.3)
+    torch.testing.assert_close(ours, render(g, *AXIS, backend="reference")[0], atol=1e-5, rtol=1e-4)
