@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +13,7 @@ from ..gaussians import Gaussians4D
 from ..geometry.shared_paths import ride
 from ..geometry.surroundings import expanded
 from ..io.asset import STATIC_SIGMA_T
-from ..rotations import quaternion_multiply
+from ..rotations import conjugate, quaternion_multiply, rotate
 from ..tracks import Tracks4D
 from .motion_table import MotionTable, spread_points
 from .posing import Bending
@@ -22,6 +22,7 @@ from .skinning import Skin
 CONTROL_POINTS = 800
 NEAREST = 4  # control points by which a Gaussian is moved
 NEIGHBOURS = 6  # control points that a control point should keep its distance from
+INVERSIONS = 5  # steps by which it is found where a point is at rest
 SEEN = 0.05  # opacity from which on a Gaussian may have a control point
 
 
@@ -61,7 +62,7 @@ class ControlPoints:
 @dataclass
 class DeformingCloud:
     """A `DynamicScene` of what is trained: xyz (N,3), scale (N,3) log, rotation (N,4), rgb (N,3) and opacity (N,) logit
-    at rest, and the table's values."""
+    at rest, and the table's values; and `life` (N,2), from when to when each is there, model time."""
 
     values: dict[str, Tensor]
     table: MotionTable
@@ -87,12 +88,28 @@ class DeformingCloud:
 
     def at(self, t: float) -> Gaussians4D:
         """The scene at time t in [-1,1], differentiable."""
-        v, held = self.values, (self.near, self.weight, self.control.rest)
-        xyz, rotation = Skin.apply(*held, *self.pose(t), v["xyz"], self.rotation)
+        v = self.values
+        xyz, rotation = Skin.apply(self.near, self.weight, self.control.rest, *self.pose(t), v["xyz"], self.rotation)
         still, always = torch.zeros_like(self.opacity), torch.full_like(self.opacity, STATIC_SIGMA_T)
         xyz, scale = self._expanded(xyz)
         velocity = torch.zeros_like(xyz)
-        return Gaussians4D(xyz, still, velocity, always, scale, rotation, v["rgb"], self.opacity)
+        birth, death = v["life"].unbind(1)
+        there = (birth <= t) & (t <= death)
+        opacity = self.opacity if there.all() else self.opacity * there
+        return Gaussians4D(xyz, still, velocity, always, scale, rotation, v["rgb"], opacity)
+
+    def moved(self, xyz: Tensor, t: float) -> tuple[Tensor, Tensor]:
+        """xyz (N,3) at rest, of any points -> where they are at time t (N,3), and how they are turned (N,4)."""
+        one = torch.tensor([1.0, 0, 0, 0]).expand(len(xyz), 4)
+        return Skin.apply(*self.control.influence(xyz), self.control.rest, *self.pose(t), xyz, one)
+
+    def at_rest(self, xyz: Tensor, t: float) -> Tensor:
+        """xyz (N,3) at time t -> about where these points are at rest (N,3)."""
+        rest = xyz
+        for _ in range(INVERSIONS):
+            moved, turned = self.moved(rest, t)
+            rest = rest + rotate(conjugate(turned), xyz - moved)
+        return rest
 
     def _expanded(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
         """Places (N,3) as they are moved -> places and scales (N,3) of the scene."""
@@ -101,19 +118,26 @@ class DeformingCloud:
         places, larger = expanded(xyz)
         return places, self.scale * larger
 
+    def _only(self, rows: Tensor) -> DeformingCloud:
+        values = {k: v if k == "motion" else v[rows] for k, v in self.values.items()}
+        return replace(self, values=values, near=self.near[rows], weight=self.weight[rows])
+
     @torch.no_grad()
     def to_tracks(self, frames: int, tolerance: float) -> Tracks4D:
-        """The cloud as tracks of a clip of so many frames, which they are true to within twice the tolerance."""
+        """The cloud as tracks of a clip of so many frames, which they are true to within twice the tolerance, without
+        what is there at none of them."""
+        times = torch.linspace(-1, 1, frames)
+        birth, death = self.values["life"].T[..., None]
+        window = torch.stack([(times < birth).sum(1), frames - 1 - (times > death).sum(1)], 1)
+        lived = window[:, 0] <= window[:, 1]
+        if not lived.all():
+            return self._only(lived).to_tracks(frames, tolerance)
         v, control = self.values, self.control
         one = torch.tensor([1.0, 0, 0, 0]).expand(len(self), 4)
-        moved = [
-            Skin.apply(self.near, self.weight, control.rest, *self.pose(t), v["xyz"], one)
-            for t in torch.linspace(-1, 1, frames).tolist()
-        ]
+        moved = [Skin.apply(self.near, self.weight, control.rest, *self.pose(t), v["xyz"], one) for t in times.tolist()]
         scales = [self._expanded(m[0])[1] for m in moved]
         place = torch.stack([self._expanded(m[0])[0] for m in moved], 1)
         turn = torch.stack([m[1] for m in moved], 1)
-        window = torch.tensor([0, frames - 1]).expand(len(self), 2)
         path, offset, rotation, paths = ride(place, turn, window, tolerance)
         return Tracks4D(
             offset=offset,

@@ -5,8 +5,8 @@ share, moved by control points (SC-GS, Huang et al. 2024), and both fitted to th
 Where things move fast, what a view shows is far from where it was in the views that are known, and no gradient leads
 there. So a fit begins in the middle of the clip and goes on to its ends, each moment from where those before it lead;
 motion is a table of several levels (`motion_table.py`), smooth in time until all of the clip is looked at, then
-sharper and with places chosen anew, among what has been found; pictures are small at first; and neighbours are held
-together less and less.
+sharper and with places chosen anew, among what has been found, which what comes and goes joins (`appearing.py`);
+pictures are small at first; and neighbours are held together less and less.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ..geometry.silhouettes import points_inside
 from ..geometry.surroundings import EDGE, is_whole, points_around
 from ..tracks import Tracks4D
 from ..views import Views
+from .appearing import EVER, lives, missing_points, unshown
 from .cloud import SEEN, ControlPoints, DeformingCloud
 from .motion_table import SEVERAL, SHARP, MotionTable
 from .thin import thinned
@@ -52,6 +53,8 @@ class DeformFit:
     start: int = 1000  # Gaussians at the start
     first_views: int = 8  # nearest to the middle of the clip, or all of one moment, which say where these are
     start_opacity: float = 0.1
+    later_opacity: float = 0.5  # of what joins later, where something is missing; …
+    later_share: float = 0.25  # … of each moment no more than this share of those that there may be
     window: float = 0.4  # share of the schedule after which all of the clip is looked at
     front: float = 0.5  # of the views until then are of the moments that came in last
     margin: float = 2.5  # frames about the middle at the start, and of what counts as last
@@ -100,7 +103,7 @@ class _Fit:
     def __init__(self, views: Views, max_gaussians: int, seed: int):
         self.several = len(views) >= SEVERAL * len(views.time.unique())
         fit = self.fit = FIT if self.several else ALONE
-        self.views, self.pixel = views, views.pixel
+        self.views, self.pixel, self.seed = views, views.pixel, seed
         self.pyramid = pyramid_of(max(views.size))
         smaller = self.smaller = reduction(views, self.pyramid[0][1])
         self.stages = _stages(self.pyramid, views, max_gaussians)
@@ -114,11 +117,12 @@ class _Fit:
         xyz, rgb = points(middle, min(most, self.stage.gaussians), self.generator)
         self.table = MotionTable.around(xyz, round(2 / views.frame_step) + 1, self.several, self.generator)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
+        rates["life"] = 0.0, 0.0  # it stays as silhouettes say
         first, last = fit.xyz
         rates["xyz"] = first * self.pixel * smaller, last * self.pixel
         moves = float(views.time.max() - views.time.min()) > 0
         rates["motion"] = tuple(moves * views.frame_step * r for r in fit.motion)
-        values = self._start(xyz, rgb) | {"motion": self.table.zeros()}
+        values = self._start(xyz, rgb, fit.start_opacity) | {"motion": self.table.zeros()}
         self.parameters = Parameters(values, rates, common=["motion"])
         self.densifier = self._densifier()
         self.half = self._half(0.0)  # how far from the middle the fit has come, and moments beyond it
@@ -126,7 +130,7 @@ class _Fit:
         self._place()
         self._bind()
 
-    def _start(self, xyz: Tensor, rgb: Tensor) -> dict[str, Tensor]:
+    def _start(self, xyz: Tensor, rgb: Tensor, opacity: float) -> dict[str, Tensor]:
         n = len(xyz)
         parts = xyz.split(4096)
         apart = torch.cat([torch.cdist(p, xyz).topk(min(4, n), largest=False).values[:, 1:].mean(1) for p in parts])
@@ -135,7 +139,8 @@ class _Fit:
             "scale": apart.clamp(0.3 * self.pixel, 0.1).log()[:, None].expand(-1, 3),
             "rotation": torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
             "rgb": rgb,
-            "opacity": torch.full((n,), self.fit.start_opacity).logit(),
+            "opacity": torch.full((n,), opacity).logit(),
+            "life": torch.tensor([-EVER, EVER]).expand(n, 2),
         }
 
     @torch.no_grad()
@@ -178,9 +183,32 @@ class _Fit:
         grey = torch.full((3,), 0.5)
         return float(photometric_loss(draw(self.cloud(), views, grey, 0.0)))
 
+    @torch.no_grad()
+    def _join(self) -> None:
+        """What has no Gaussians, for it is not there in the middle of the clip, gets some, a life with them; from the
+        middle to the ends, so that what is found at a moment is not missing at the next."""
+        views, fit = downsampled(self.views, self.smaller), self.fit
+        generator = torch.Generator().manual_seed(self.seed)  # of its own: where nothing joins, all is as without
+        left = unshown(self.cloud(), views)
+        for t in sorted(views.time.unique().tolist(), key=abs):
+            xyz, rgb = missing_points(left, t, fit.first_views, generator)
+            room = max(int(fit.later_share * self.stage.gaussians), LEAST)
+            room = min(room, self.stages[-1].gaussians - len(self.near))
+            if min(len(xyz), room) < LEAST:
+                continue
+            cloud = self.cloud()
+            new = self._start(cloud.at_rest(xyz[:room], t), rgb[:room], fit.later_opacity)
+            new["life"] = lives(cloud, new["xyz"], views, t)
+            self.parameters.add_rows(new)
+            self._bind()
+            self.densifier = self._densifier()
+            left = unshown(self.cloud(), views)
+
     def _sharpen(self) -> None:
-        """Once all of the clip is looked at: moments count over a shorter time, and places, which were among what the
-        silhouettes left possible, are now among what has been found."""
+        """Once all of the clip is looked at: what comes and goes joins, moments count over a shorter time, and places,
+        which were among what the silhouettes left possible, are now among what has been found."""
+        if not self.whole:
+            self._join()
         values = self.parameters["motion"].detach()
         self.table.sharpen(values, SHARP[self.several])
         self.table, values = self.table.among(values, self._found(), self.generator)

@@ -84,6 +84,15 @@ class Parameters:
             self.values[k].grad = None if old.grad is None else old.grad[keep]
             self.moments[k] = tuple(m[keep].clone() for m in self.moments[k])
 
+    @torch.no_grad()
+    def add_rows(self, new: dict[str, Tensor]) -> None:
+        """Adds rows to every tensor that is not common, with gradients (where there are any) and moments of 0."""
+        for k, rows in new.items():
+            old, none = self.values[k], torch.zeros_like(rows)
+            self.values[k] = torch.cat([old.detach(), rows]).requires_grad_()
+            self.values[k].grad = None if old.grad is None else torch.cat([old.grad, none])
+            self.moments[k] = tuple(torch.cat([m, none]) for m in self.moments[k])
+
     def replace(self, name: str, value: Tensor) -> None:
         """Puts other values in the place of those of this name; of any shape, with moments of 0 and no gradient."""
         self.values[name] = value.detach().clone().requires_grad_()

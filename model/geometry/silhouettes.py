@@ -22,7 +22,7 @@ def points_inside(views: Views, count: int, generator: torch.Generator, share: f
     found, total, tried = [], 0, max(4 * count, 10_000)
     while total < count:
         points = HALF_SIDE * (2 * torch.rand(tried, 3, generator=generator) - 1)
-        framed, seen, colour = _seen(chosen, points)
+        framed, seen, colour = seen_inside(chosen, points)
         inside = (framed >= FRAMED * len(chosen)) & (seen >= share * framed) | (share <= 0)
         if inside.sum() < LEAST_SHARE * tried:
             share -= 0.1
@@ -32,7 +32,7 @@ def points_inside(views: Views, count: int, generator: torch.Generator, share: f
     return torch.cat(found)[:count].split(3, 1)
 
 
-def _seen(views: Views, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def seen_inside(views: Views, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """points (N,3) -> in how many views each is within the frame (N,), in how many of these inside the silhouette
     (N,), and the mean colour there (N,3)."""
     height, width = views.size

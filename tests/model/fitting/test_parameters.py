@@ -36,6 +36,10 @@ def test_rows_take_their_moments_along_and_nan_moves_nothing():
     assert p["a"].tolist() == pytest.approx([-1, -1, 0], abs=1e-6) and p["a"].requires_grad
     p.reset_moments(torch.tensor([0]))
     assert p.moments["a"][0][0] == 0 and p.moments["a"][0][1] != 0
+    (p["a"] * torch.arange(3.0)).sum().backward()
+    p.add_rows({"a": torch.tensor([7.0]), "b": torch.ones(1, 2)})
+    assert p["a"].grad.tolist() == [0, 1, 2, 0] and p["b"].grad is None and p["b"][3].tolist() == [1, 1]
+    assert p["a"][3] == 7 and p["a"].requires_grad and p.moments["a"][1][1] != 0 and p.moments["a"][1][3] == 0
 
 
 def test_raw_parameters_activate_to_the_same_gaussians(spheres):
