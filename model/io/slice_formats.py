@@ -22,7 +22,7 @@ from .asset import SH_C0, Asset, linear_from_srgb, xyzw_from_wxyz
 from .placement import rotate_quaternions
 from .ply import columns_3dgs, ply_bytes
 from .sog import sog
-from .splat_files import SPLAT_RECORD
+from .splat_files import PLAUSIBLE, SPLAT_RECORD, plausible
 
 SPZ_COLOUR = 0.15  # of a byte's range for one of a coefficient
 MAX_SPZ_FRACTION = 20  # bits after the point: a millionth
@@ -35,12 +35,16 @@ def ply(part: Asset, frame: float) -> bytes:
 
 
 def splat(part: Asset, frame: float) -> bytes:
-    """Large and opaque ones first, because viewers show a .splat while it loads."""
+    """Large and opaque ones first, because viewers show a .splat while it loads. Raises InputError for what would be
+    taken for another kind of file."""
     order = np.argsort(-part.scale.prod(1, dtype=np.float64) * part.opacity, kind="stable")
     rows = np.empty(len(part), SPLAT_RECORD)
     rows["xyz"], rows["scale"] = part.xyz, part.scale
     rows["rgb"], rows["opacity"] = (np.round(a.clip(0, 1) * 255) for a in (part.rgb, part.opacity))
     rows["rotation"] = np.round(part.rotation * 128 + 128).clip(0, 255)
+    if plausible(rows).mean() < PLAUSIBLE:
+        reach = float(np.abs(part.xyz).max())
+        raise InputError(f"it reaches {reach:g} units from the origin, which nobody takes for a .splat; write a .ply.")
     return rows[order].tobytes()
 
 

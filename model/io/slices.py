@@ -23,13 +23,15 @@ def slice_at(asset: Asset, frame: float, cut: float = VISIBLE) -> Asset:
     """What is visible at a (fractional) frame as an asset that does not change, for tools that know nothing of
     time: in world units, with Z turned to -Y, which those take for up; scales are `soft_scale`. Beyond the
     clip's ends it is held, as on the timeline. Where nothing has the opacity `cut` the least faint Gaussian
-    stays, because empty files are refused by many."""
+    stays, of several the nearest to the middle, because empty files are refused by many, and files of what is
+    elsewhere than anything can be."""
     clip = asset.clip
     held = min(max(frame, clip.frame_start), clip.frame_end)
     time = clip.frame_to_time(held)
     xyz, opacity = asset.at(time)
     seen = opacity >= cut
-    seen[opacity.argmax()] |= not seen.any()
+    if not seen.any():
+        seen[np.lexsort((np.abs(xyz).max(1), -opacity))[:1]] = True
     world = xyz[seen] * np.float32(clip.scale) + np.array(clip.translation, np.float32)
     return static_asset(
         "the slice",

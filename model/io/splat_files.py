@@ -39,6 +39,7 @@ from .ply import sound_asset_from_bytes
 from .ply_tables import MAX_HEADER_BYTES, PlyTables
 
 SCALE_BOUNDS = ("scale_x", "scale_y", "scale_z")  # of a compressed .ply's chunks
+PLAUSIBLE = 0.9  # share of a .splat's Gaussians that must be; it says nothing else of what it is
 SPLAT_RECORD = np.dtype(
     [("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgb", "u1", 3), ("opacity", "u1"), ("rotation", "u1", 4)]
 )
@@ -154,6 +155,12 @@ def _read_compressed(data: bytes, path: Path) -> Asset:
 # ---------------------------------------------------------------- .splat
 
 
+def plausible(rows: np.ndarray) -> np.ndarray:
+    """(N,) of SPLAT_RECORD -> (N,) bool: whether these could be the place and the scale of a Gaussian."""
+    with np.errstate(invalid="ignore"):
+        return (np.abs(rows["xyz"]) < 1e9).all(1) & (rows["scale"] >= 0).all(1) & (rows["scale"] < 1e9).all(1)
+
+
 def read_splat(path: Path) -> LoadedAsset:
     """32 bytes a Gaussian and nothing else, so that only implausible values tell another kind of file."""
     data = path.read_bytes()
@@ -165,9 +172,8 @@ def read_splat(path: Path) -> LoadedAsset:
     xyz, scale = rows["xyz"], rows["scale"]
     rotation = rows["rotation"].astype(np.float32) / 128 - 1
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) < 0.1
-    with np.errstate(invalid="ignore"):
-        sane = (np.abs(xyz) < 1e9).all(1) & (scale >= 0).all(1) & (scale < 1e9).all(1)
-    if min(sane.mean(), unit.mean()) < 0.9:
+    sane = plausible(rows)
+    if min(sane.mean(), unit.mean()) < PLAUSIBLE:
         wrong = (~(sane & unit)).sum()
         raise _wrong_file(path, data, f"it is damaged or not a .splat ({wrong} of {len(rows)} Gaussians make no sense)")
     rgb, opacity = (rows[name].astype(np.float32) / 255 for name in ("rgb", "opacity"))

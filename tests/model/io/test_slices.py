@@ -70,6 +70,18 @@ def test_a_moment_at_which_nothing_is_visible_has_one_gaussian(tmp_path):
     asset.t[:], asset.sigma_t[:] = 1, 0.01
     assert write_slice(tmp_path / "s.ply", asset, 3) == 1
     assert read_asset(tmp_path / "s.ply").asset.opacity[0] < 1e-5
+    asset.t[:], asset.velocity[:] = -1e15, 1  # where they would be is nowhere
+    asset.velocity[7] = 0
+    assert write_slice(tmp_path / "s.splat", asset, 3) == 1
+    assert np.abs(read_asset(tmp_path / "s.splat").asset.xyz).max() < 10
+
+
+def test_what_no_reader_would_take_for_a_splat_is_not_written(tmp_path):
+    asset = make_asset(30, clip=CLIP)
+    asset.xyz[:, 0] = 1e12
+    with pytest.raises(InputError, match=r"s\.splat: it reaches .* write a \.ply"):
+        write_slice(tmp_path / "s.splat", asset, 6)
+    assert not list(tmp_path.iterdir())
 
 
 def test_slices_come_whole_or_not_at_all(tmp_path, monkeypatch):
