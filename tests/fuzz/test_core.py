@@ -108,6 +108,10 @@ def check_drawing(seed: int) -> None:
         assert (rgb - right).abs().mean() < 1e-3
 
 
+def test_what_is_further_away_than_float32_tells():
+    check_drawing(120993)
+
+
 test_drawing, test_drawing_by_the_thousand = suite(check_drawing, 100)
 
 
@@ -167,6 +171,10 @@ def check_export(seed: int) -> None:
                 # as logarithms and logits, in single precision; what is nearer to 0 or 1 than these tell is not told
                 assert np.allclose(again.scale, asset.scale, rtol=1e-4)
                 assert np.allclose(again.opacity, asset.opacity, atol=1e-5)
+
+
+def test_what_is_left_where_nothing_shows_is_no_monstrous_splat():
+    check_export(343)
 
 
 test_export, test_export_by_the_thousand = suite(check_export, 40)

@@ -22,6 +22,7 @@ from .layout import (
 from .simd import bits, gather, log2, select, splat, sqrt, store
 from .tiles import bin_rows
 
+FAR = 1e30  # pixels beyond which no centre is looked for: rows are float32
 LOG_INFERENCE_MIN = math.log2(INFERENCE_MIN)
 
 
@@ -155,6 +156,7 @@ def _prepare(
     camera = camera_of(c, c2w, intrinsics, width, height)
     now, one, zero = splat(time[c]), splat(1.0), splat(0.0)
     scale, least, filtered = splat(math.sqrt(0.5 * LOG2E)), splat(np.float64(LOG_ALPHA_MIN)), splat(LOG_INFERENCE_MIN)
+    far = splat(FAR)
     w, h, near = splat(np.float64(width)), splat(np.float64(height)), splat(np.float64(NEAR_PLANE))
     lanes, kept = np.zeros(PARAMS * 8, np.float32), 0
     for at in range(0, count, 8):
@@ -170,6 +172,7 @@ def _prepare(
         rx, ry = sqrt(q * sxx), sqrt(q * syy)
         det = sxx * syy - sxy * sxy
         seen = (o > zero) & (log >= least) & (p[2] >= near) & (det > zero)
+        seen = seen & (far > mx) & (mx > zero - far) & (far > my) & (my > zero - far)
         seen = seen & (mx + rx > zero) & (w > mx - rx) & (my + ry > zero) & (h > my - ry)
         if inference:
             seen = seen & (marginal >= filtered) & (log >= filtered)
