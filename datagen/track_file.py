@@ -8,6 +8,7 @@ orthonormal frame of reference that turns with the surface, is what the method `
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def read_tracks(path: Path, frames: int) -> SurfaceTracks:
             arrays = {name: file[name] for name in _KINDS}
     except KeyError as e:
         raise ValueError(f"the array {e} is missing") from None
-    except (zipfile.BadZipFile, EOFError) as e:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as e:  # as the zip says it is
         raise ValueError(f"it is damaged: {e}") from None
     n = len(arrays["position"]) if arrays["position"].ndim else 0
     shapes = {"position": (n, frames, 3), "rotation": (n, frames, 4), "first": (n,), "last": (n,), "area": (n,)}

@@ -87,4 +87,8 @@ def check_file(seed: int) -> None:
         assert len(shown) <= len(asset)
 
 
+def test_all_of_it_is_beyond_belief():
+    check_file(14760)
+
+
 test_damaged_files, test_damaged_files_by_the_thousand = suite(check_file, 200)

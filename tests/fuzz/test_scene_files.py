@@ -143,4 +143,8 @@ def check_single(seed: int) -> None:
             assert name == "ours.exr"
 
 
+def test_a_zip_of_a_kind_that_python_does_not_know():
+    check_single(132_172_960_312)
+
+
 test_damaged_single_files, test_damaged_single_files_by_the_thousand = suite(check_single, 200)
