@@ -18,11 +18,9 @@ from .cloud import DeformingCloud
 
 TRIED, ROUNDS = 10_000, 10  # random points at a time, and how often, where some of the first are missing
 AT_ONCE = 64  # views that are drawn at a time
-FRAMED, AGREE = (
-    0.5,
-    0.7,
-)  # share of the views about a moment that must frame a point, and, of these, that must miss it …
-UNSHOWN = 0.3  # … where the cloud's alpha is below this
+FRAMED = 0.5  # share of the views about a moment that must frame a point; …
+AGREE = 0.7  # … of these that must miss it, …
+UNSHOWN = 0.3  # … which they do where the cloud's alpha is below this
 INSIDE = 0.9  # share of a moment's views that must have a point inside of the silhouette, while it is there
 EVER = 2.0  # model time that is not reached, before the clip and after it
 
