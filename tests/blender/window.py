@@ -66,6 +66,8 @@ def answer():
             json.dump([number, said], f, default=str)
         os.replace(FOLDER + "/answer.tmp", FOLDER + "/answer")
     return 0.05
+drawn = []  # something, once the 3D view has been drawn
+bpy.types.SpaceView3D.draw_handler_add(lambda: drawn or drawn.append(True), (), "WINDOW", "POST_PIXEL")
 bpy.app.timers.register(answer, persistent=True)
 """
 
@@ -112,7 +114,7 @@ class Window:
             stderr=subprocess.STDOUT,
         )
         try:
-            self.wait_for("bpy.context.window_manager.windows[0].width > 0", 120)
+            self.wait_for("drawn", 300)  # the first time shaders are compiled, which takes minutes on a busy machine
         except BaseException:
             self.__exit__()
             raise
@@ -190,6 +192,13 @@ class Window:
 
     # ------------------------------------------------------------ to act
 
+    def settle(self) -> None:
+        """Waits until Blender has dealt with what it was sent, however busy the machine is: it takes events in before
+        it answers, and deals with them before it answers again."""
+        with contextlib.suppress(AssertionError):  # it may have been told to quit
+            self.ask("None")
+            self.ask("None")
+
     def _run(self, name: str, *args) -> None:
         command = [tool(self.blender, name), *map(str, args)]
         subprocess.run(command, env=self.env, check=True, timeout=60, stdout=subprocess.DEVNULL)
@@ -205,6 +214,7 @@ class Window:
         free = ["keyup", keys] if keys else []
         self._run("xdotool", *hold, "click", "--repeat", times, "--delay", 80, button, *free)
         time.sleep(0.3)
+        self.settle()
 
     def drag(self, x0: float, y0: float, x1: float, y1: float, button: int = 1, steps: int = 10) -> None:
         self.move(x0, y0)
@@ -213,9 +223,11 @@ class Window:
         for i in range(1, steps + 1):
             time.sleep(0.1)
             self.move(x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps)
+            self.settle()
         time.sleep(0.2)
         self._run("xdotool", "mouseup", button)
         time.sleep(0.3)
+        self.settle()
 
     def wheel(self, steps: int) -> None:
         """Turns the wheel where the mouse is: up, or down where `steps` is negative."""
@@ -223,12 +235,14 @@ class Window:
             self._run("xdotool", "click", 4 if steps > 0 else 5)
             time.sleep(0.1)
         time.sleep(0.3)
+        self.settle()
 
     def key(self, *keys: str) -> None:
         """Key presses one after another, like key("ctrl+z", "Return")."""
         for k in keys:
             self._run("xdotool", "key", k)
             time.sleep(0.25)
+            self.settle()
 
     def focus(self) -> None:
         """Gives the keyboard to the main window: a window manager, of which there is none here, would."""
@@ -244,6 +258,7 @@ class Window:
     def type(self, text: str) -> None:
         self._run("xdotool", "type", "--delay", 25, text)
         time.sleep(0.3)
+        self.settle()
 
     # ------------------------------------------------------------ to find what Python cannot point at
 
@@ -251,10 +266,10 @@ class Window:
         """What Blender copies when a person presses ctrl+C over a button: the Python of an operator, the value of
         a setting; with "ctrl+shift+c" a setting's name."""
         self.move(x, y)
-        time.sleep(0.25)
+        self.settle()
         self.ask("clipboard()")
         self._run("xdotool", "key", keys)
-        time.sleep(0.1)
+        self.settle()
         return self.ask("clipboard()")
 
     def find(self, wanted: str, x: float, top: float, bottom: float, keys: str = "ctrl+c", step: int = 10) -> float:
