@@ -86,7 +86,8 @@ def _option(parser, chosen, key: str) -> None:
 
 
 def _render(chosen, args) -> None:
-    rig = {"rig": args.rig, "targets": args.targets, "seed": args.seed, "passes": args.passes, "tracks": 0}
+    keys = ("rig", "targets", "seed", "passes")
+    rig = {key: getattr(args, key) for key in keys} | {"tracks": 0, "last": None}
     request = reconstruct.request(chosen, bpy.context) | rig | {"sequence": str(args.out.resolve())}
     stages = [lambda folder: start_capture(request, folder)]
     job = jobs.start("Rendering", stages, lambda event, folder: f"{event['pictures']} pictures")

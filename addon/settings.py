@@ -80,7 +80,8 @@ class Settings:
     frame_end: IntProperty(name="End", default=24)
     every: IntProperty(
         name="Frame Step",
-        description=f"Capture every n-th frame; 0: so many that there are at most {MOST_AUTOMATIC_FRAMES}",
+        description="Pictures of every n-th frame; 0: of so many that there are at most "
+        f"{MOST_AUTOMATIC_FRAMES}. Tracks follows the surface through those between too",
         min=0,
         max=1000,
     )
@@ -132,7 +133,8 @@ def _set_step(settings, value: int) -> None:
 class TIMESPLAT_PG_settings(Settings, bpy.types.PropertyGroup):
     frame_step: EnumProperty(
         name="Frame Step",
-        description="Which frames of the range are captured",
+        description="Of which frames of the range pictures are taken. Tracks follows the surface through those between "
+        "too",
         items=[
             ("AUTO", "Auto", f"As many as there may be with an even step: at most {MOST_AUTOMATIC_FRAMES}"),
             ("EVERY", "Every", "Every n-th"),
@@ -152,14 +154,20 @@ def spread(first: int, last: int, count: int) -> range:
     return range(first, last + 1, step)[:count]
 
 
-def frames(settings, scene) -> range:
-    """The scene frames to capture. Raises InputError for an empty range."""
+def span(settings, scene) -> tuple[int, int]:
+    """The first and the last scene frame of the clip. Raises InputError for an empty range."""
     own = settings.frame_range == "CUSTOM"
     first, last = (settings.frame_start, settings.frame_end) if own else (scene.frame_start, scene.frame_end)
     if not own and (end := survey.animation_end(scene.objects)) is not None and first < end < last:
         last = end
     if last < first:
         raise InputError(f"Frames {first} to {last}: the range is empty; let it end after its start.")
+    return first, last
+
+
+def frames(settings, scene) -> range:
+    """The scene frames of which pictures are taken. Raises InputError for an empty range."""
+    first, last = span(settings, scene)
     return range(first, last + 1, settings.every) if settings.every else spread(first, last, MOST_AUTOMATIC_FRAMES)
 
 

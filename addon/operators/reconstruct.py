@@ -73,6 +73,7 @@ def request(chosen, context) -> dict:
         "objects": [o.name_full for o in objects],
         "cameras": [o.name_full for o in cameras],
         "frames": list(settings.frames(chosen, context.scene)),
+        "last": settings.span(chosen, context.scene)[1] if method == "tracks" else None,
         "in_turn": chosen.in_turn,
         "size": chosen.size,
         "samples": chosen.samples,

@@ -2,7 +2,9 @@
 """Renders the pictures, in a background Blender (`background_blender`). The request:
 objects    full names of what is captured       cameras    full names of cameras, or [] for those of `rig`
 rig, targets, seed   (optional) of `datagen.rigs`: default coverage, none, 0
-frames     scene frames                         in_turn    one camera a frame, instead of all of them
+frames     scene frames of which pictures are taken, evenly apart
+last       (optional) up to this scene frame surfaces are followed between them too
+in_turn    one camera a frame, instead of all of them
 size, samples, passes, lighting                 as `datagen.render_setup.CaptureSettings` has them
 tracks     (optional) how many points of surfaces are followed, 0 for one a pixel (the default); None: none
 sequence   folder to write
@@ -18,10 +20,12 @@ import numpy as np
 from ...datagen import rigs
 from ...datagen.capture import Subject, capture
 from ...datagen.render_setup import CaptureSettings
-from ...datagen.scene.measure import normalisation
+from ...datagen.scene.measure import normalisation, vertices_at
 from ...datagen.scene.open import tool_versions
 from ...datagen.scene.simulate import simulate
+from ...datagen.scene.surfaces import MOST_FLOATS
 from ...datagen.sequence import InputError, Normalisation
+from ...datagen.tracks import MOST
 from ..asset.visibility import HIDDEN
 from . import background_blender, child_process
 
@@ -31,20 +35,37 @@ def start_capture(request: dict, folder: Path) -> child_process.Child:
     return background_blender.start("addon.runtime.capture", request, folder)
 
 
-def camera_shots(scene, cameras: list, frames: list[int], norm: Normalisation, in_turn: bool) -> list[rigs.Shot]:
+def clip_frames(request: dict, objects: list) -> list[int]:
+    """The scene frames of the clip: those of the pictures, and between them and up to the request's `last` as many,
+    just as evenly, as there is memory for to follow surfaces through: all of them, as a rule."""
+    taken, last = request["frames"], request.get("last")
+    if last is None or len(taken) < 2:
+        return taken
+    every = taken[1] - taken[0]
+    (shapes,) = vertices_at(taken[:1], objects)
+    followed = request["tracks"] or min(request["size"] ** 2, MOST)
+    most = MOST_FLOATS // max(3 * sum(len(points) for _, points in shapes), 7 * followed)
+    for step in range(1, every):
+        if every % step == 0 and len(frames := range(taken[0], last + 1, step)) <= most:
+            return list(frames)
+    return taken
+
+
+def camera_shots(scene, cameras: list, frames: dict[int, int], norm: Normalisation, in_turn: bool) -> list[rigs.Shot]:
     """What the scene's own cameras see at each frame (or one of them in turn), in normalised space: perspective,
-    square. What is hidden in the viewport or in an excluded collection is not evaluated: it is linked and shown."""
+    square. frames: number in the clip -> scene frame. What is hidden in the viewport or in an excluded collection is
+    not evaluated: it is linked and shown."""
     for ob in cameras:
         if scene.collection not in ob.users_collection:
             scene.collection.objects.link(ob)
         ob.hide_viewport = False
         ob.hide_set(False)
     shots = []
-    for i, frame in enumerate(frames):
+    for i, (number, frame) in enumerate(frames.items()):
         scene.frame_set(frame)
         for ob in [cameras[i % len(cameras)]] if in_turn else cameras:
             fov, shift = float(np.degrees(ob.data.angle)), (ob.data.shift_x, ob.data.shift_y)
-            shots.append(rigs.Shot(i, ob.name_full, "scene", norm.from_world(rigid_pose(ob)), fov, shift))
+            shots.append(rigs.Shot(number, ob.name_full, "scene", norm.from_world(rigid_pose(ob)), fov, shift))
     return shots
 
 
@@ -63,21 +84,22 @@ def rigid_pose(ob) -> np.ndarray:
 
 
 def _capture(request: dict, progress) -> dict:
-    scene, frames = bpy.context.scene, request["frames"]
+    scene = bpy.context.scene
     by_name = {ob.name_full: ob for ob in scene.objects}  # names alone are not unique: two libraries may use one
     objects, cameras = ([by_name[n] for n in request[key]] for key in ("objects", "cameras"))
     for ob in objects:
         if ob.get(HIDDEN):
             ob.hide_render = False
     progress(0.02, "measuring the object")
-    simulate(frames[-1])
-    norm, aabb = normalisation(frames, objects, name=scene.name)
-    numbers, seed, rig = range(len(frames)), request.get("seed", 0), request.get("rig")
+    simulate(max(request["frames"][-1], request.get("last") or 0))
+    frames = clip_frames(request, objects)
+    norm, aabb = normalisation(request["frames"], objects, name=scene.name)  # what pictures show is within
+    taken, seed, rig = {frames.index(f): f for f in request["frames"]}, request.get("seed", 0), request.get("rig")
     if cameras and not rig:
-        shots = camera_shots(scene, cameras, frames, norm, request["in_turn"])
+        shots = camera_shots(scene, cameras, taken, norm, request["in_turn"])
     else:
-        shots = rigs.RIGS[rig or "coverage"](numbers, seed)
-    shots += rigs.targets(numbers, seed, request.get("targets", 0))
+        shots = rigs.RIGS[rig or "coverage"](list(taken), seed)
+    shots += rigs.targets(list(taken), seed, request.get("targets", 0))
 
     def rendered(done: int, total: int) -> None:
         progress(0.05 + 0.95 * done / total, f"rendering: picture {done} of {total}")
