@@ -9,7 +9,9 @@ import pytest
 from timesplat.model.io.asset import Asset, Clip
 from timesplat.model.io.ply import write_ply
 
-SCENE = """
+from ..helpers import REAL
+
+BUILD = """
 part("addon").register()
 display, sliders = part("addon.asset.display"), part("addon.asset.sliders")
 compare = part("addon.operators.compare")
@@ -33,6 +35,10 @@ scene.collection.objects.link(camera)
 camera.location, camera.rotation_euler = (0, -3, 0), (np.pi / 2, 0, 0)
 scene.render.resolution_x, scene.render.resolution_y = 300, 200
 scene.frame_set(7, subframe=0.25)
+"""
+SCENE = (
+    BUILD
+    + """
 def state():
     look = sliders.get_input(sliders.asset_modifier(ob), "Look")
     return [scene.frame_current_final, look, scene.render.engine, scene.render.resolution_x, scene.render.filepath,
@@ -93,11 +99,28 @@ except RuntimeError as e:
 tell(**told)
 part("addon").unregister()  # older wheels of bpy do not end with classes of an add-on in them
 """
+)
+CRASH = (
+    BUILD
+    + """
+import signal
+scene.camera = camera
+job = compare.start(ob, bpy.context, 32, 1)
+while job.state == "running" and "rendering" not in job.text:
+    job.advance(0.25)
+os.kill(job.child.process.pid, signal.SIGSEGV)
+while job.state == "running":
+    job.advance(0.25)
+left = os.listdir(part("addon.runtime.folders").user_folder("runs"))
+tell(state=job.state, message=job.message, log=job.log_text(), left=left)
+"""
+)
 
 
-def test_compare(blender, tmp_path):
-    """A red ball that glows beside one fat Gaussian of the same colour."""
-    one = {
+@pytest.fixture
+def one(tmp_path):
+    """One fat Gaussian in tmp_path/a.ply."""
+    arrays = {
         "xyz": [[0, 0, 0]],
         "t": [0],
         "velocity": [[0, 0, 0]],
@@ -107,8 +130,13 @@ def test_compare(blender, tmp_path):
         "rgb": [[0.9, 0.35, 0.35]],
         "opacity": [0.999],
     }
-    asset = Asset(**{k: np.array(v, np.float32) for k, v in one.items()}, clip=Clip(24, 1, 24))
+    asset = Asset(**{k: np.array(v, np.float32) for k, v in arrays.items()}, clip=Clip(24, 1, 24))
     write_ply(tmp_path / "a.ply", asset)
+    return arrays
+
+
+def test_compare(blender, one, tmp_path):
+    """A red ball that glows beside one fat Gaussian of the same colour."""
     told = blender(SCENE, tmp_path / "a.ply")
     yes, no = [True, True], [False, False]
     assert told["shown"] == [[no, no, no], [yes, no, no], [no, no, yes], [no, no, no]]
@@ -127,3 +155,11 @@ def test_compare(blender, tmp_path):
         "frames are seen as they are then"
     )
     assert min(told["cube"][0]) > 0.99 and max(told["cube"][1]) < 0.95  # unnamed, all but assets is the original
+
+
+@pytest.mark.skipif(not REAL, reason="Blender as a Python module writes no log when it crashes")
+def test_what_a_crash_left_stays(blender, one, tmp_path):
+    told = blender(CRASH, tmp_path / "a.ply")
+    assert told["state"] == "failed" and told["left"] == []
+    assert "The process" in told["message"], told["message"]
+    assert "scene.crash.txt" in told["log"] and "backtrace" in told["log"].lower(), told["log"]
