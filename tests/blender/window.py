@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 
 WIDTH, HEIGHT = 1600, 1000
+PATIENCE = 300  # seconds that Blender has for an answer, of which it needs a tenth of one on a machine of its own
 # Looks for <folder>/question (a Python expression) and answers in <folder>/answer.
 OBSERVER = """
 import bpy, json, os, sys
@@ -114,7 +115,7 @@ class Window:
             stderr=subprocess.STDOUT,
         )
         try:
-            self.wait_for("drawn", 300)  # the first time shaders are compiled, which takes minutes on a busy machine
+            self.wait_for("drawn")  # the first time shaders are compiled, which takes minutes on a busy machine
         except BaseException:
             self.__exit__()
             raise
@@ -134,7 +135,7 @@ class Window:
 
     # ------------------------------------------------------------ to see
 
-    def ask(self, question: str, timeout: float = 60):
+    def ask(self, question: str, timeout: float = PATIENCE):
         """The value of a Python expression in Blender. Raises AssertionError where none comes."""
         self.asked += 1
         box = self.folder / "observer"
@@ -151,12 +152,12 @@ class Window:
         self.picture("no answer")
         raise AssertionError(f"no answer to {question}")
 
-    def wait_for(self, question: str, timeout: float = 60):
+    def wait_for(self, question: str, timeout: float = PATIENCE):
         """Asks until the answer is true; returns it."""
         end, said = time.monotonic() + timeout, None
         while time.monotonic() < end:
             with contextlib.suppress(AssertionError):
-                said = self.ask(question, min(timeout, 20))
+                said = self.ask(question, min(timeout, 60))
                 if said and not str(said).startswith("ERROR"):
                     return said
             if self.process.poll() is not None:
