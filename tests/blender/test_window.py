@@ -52,7 +52,7 @@ chosen.size, chosen.samples, chosen.method, chosen.budget, chosen.refine = 64, 8
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
 tell()
 """
-PATIENCE = 900  # seconds, for what takes half a minute on a machine that does nothing else
+JOBS_TAKE = 900  # seconds at most, what takes half a minute on a machine that does nothing else
 JOBS = "[(j.state, j.fraction, j.text, j.message) for j in ours('addon.runtime.jobs').JOBS]"
 STATE = "[(s.name, s.frame_current, s.render.resolution_x, s.camera) for s in bpy.data.scenes], len(bpy.data.cameras)"
 SPACE = "next(a.spaces.active for a in bpy.context.window_manager.windows[0].screen.areas if a.type == 'VIEW_3D')"
@@ -127,9 +127,9 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         w.picture("settings")
         before = w.ask(STATE)
         w.press("timesplat.reconstruct")
-        w.wait_for(f"{JOBS}[-1][1] > 0.1 and len(ours('addon.runtime.jobs').running()) == 1", PATIENCE)
+        w.wait_for(f"{JOBS}[-1][1] > 0.1 and len(ours('addon.runtime.jobs').running()) == 1", JOBS_TAKE)
         w.picture("running")
-        w.wait_for(ENDED, PATIENCE)
+        w.wait_for(ENDED, JOBS_TAKE)
         assert w.ask(JOBS)[-1][0] == "done", w.ask(JOBS)
         w.wait_for("bpy.context.object.get('timesplat')")
         assert w.ask("[o.hide_get() for o in bpy.data.objects if o.name == 'Suzanne']") == [True]
@@ -174,7 +174,7 @@ def test_from_a_fresh_profile_to_a_scrubbed_exported_asset(window, tmp_path):
         for name in ("out.ply", "out.usdz"):
             w.menu("Export", "timesplat.export_asset")
             w.choose(tmp_path / name)
-            w.wait_for(f"os.path.exists({str(tmp_path / name)!r})", PATIENCE)
+            w.wait_for(f"os.path.exists({str(tmp_path / name)!r})", JOBS_TAKE)
             w.picture(f"exported {name}")
         assert w.ask("'torch' in sys.modules or 'timesplat' in sys.modules") is False
         w.key("ctrl+s")
@@ -206,7 +206,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
         def start(seen: str) -> None:
             jobs = len(w.ask(JOBS))
             w.press("timesplat.reconstruct")
-            w.wait_for(f"len({JOBS}) == {jobs + 1} and {seen!r} in {JOBS}[-1][2]", PATIENCE)
+            w.wait_for(f"len({JOBS}) == {jobs + 1} and {seen!r} in {JOBS}[-1][2]", JOBS_TAKE)
 
         def over_the_view(*keys: str) -> None:
             w.move(view["x"] + view["w"] / 3, view["y"] + view["h"] * 0.8)
@@ -236,7 +236,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
         over_the_view("g", "x", "1", "Return", "ctrl+z", "ctrl+shift+z", "ctrl+z", "ctrl+s")
         w.picture("undone and saved while running")
         assert w.ask(JOBS)[-1][0] == "running" and not w.ask("bpy.data.is_dirty")
-        w.wait_for(ENDED + "[2:]", PATIENCE)
+        w.wait_for(ENDED + "[2:]", JOBS_TAKE)
         assert w.ask(JOBS)[-1][0] == "done", w.ask(JOBS)
         w.wait_for("bpy.context.object.get('timesplat')")
         over_the_view("ctrl+z")
@@ -250,7 +250,7 @@ def test_what_an_artist_does_while_a_job_runs(window, tmp_path):
         over_the_view("ctrl+o")
         w.choose(tmp_path / "other.blend")
         w.wait_for("bpy.data.filepath.endswith('other.blend')")
-        w.wait_for(f"{JOBS}[-1][0] == 'waiting'", PATIENCE)  # it came from another file: it waits to be asked for
+        w.wait_for(f"{JOBS}[-1][0] == 'waiting'", JOBS_TAKE)  # it came from another file: it waits to be asked for
         w.sidebar()
         w.picture("waiting in another file")
         assert w.ask("len(bpy.data.objects)") == 1
@@ -320,7 +320,7 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
         w.picture("baked")
 
         w.press("timesplat.compare", across=0.25)
-        w.wait_for(f"{JOBS} and {JOBS}[-1][0] not in ('running', 'waiting')", PATIENCE)
+        w.wait_for(f"{JOBS} and {JOBS}[-1][0] not in ('running', 'waiting')", JOBS_TAKE)
         assert w.ask(JOBS)[-1][0] == "done" and "PSNR" in w.ask(JOBS)[-1][3], w.ask(JOBS)
         w.wait_for("any(a['kind'] == 'IMAGE_EDITOR' for x in look() for a in x['areas'])")
         time.sleep(2)
@@ -395,7 +395,7 @@ def test_files_that_are_dropped_on_the_view(window, tmp_path):
         w.wait_for(f"bpy.context.object.name == {tmp_path.name!r}")
         assert f"from 2 files in {tmp_path.name}" in w.said()
         dropped("asset.usdz")
-        w.wait_for("bpy.context.object.name == 'asset'", PATIENCE)
+        w.wait_for("bpy.context.object.name == 'asset'", JOBS_TAKE)
         assert w.ask(COUNT) == 300
         dropped("letter.ply")
         time.sleep(1)
