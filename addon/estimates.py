@@ -7,9 +7,8 @@ import contextlib
 import json
 from dataclasses import dataclass
 
+from . import settings as selected
 from .runtime.folders import user_folder
-from .settings import picture_count
-from .settings import quality as quality_of
 
 # Gaussians a pixel that counts (`_pixels_that_count`): the mean of 12 objects (tracks: 7, deform: 4), until one is made
 _gaussians_a_pixel = {"tracks": 0.63, "guided": 0.19, "lift": 0.19, "deform": 0.2}
@@ -48,14 +47,14 @@ class Estimate:
 
 def estimate(settings, context) -> Estimate:
     """Nothing is evaluated or read for it. Raises InputError for an empty range of frames."""
-    n = picture_count(settings, context)
-    quality = quality_of(settings)
+    n = selected.picture_count(settings, context)
+    quality, method = selected.quality(settings), selected.expected_method(settings, context)
     pixels = n * settings.size**2
-    predicted = _gaussians_a_pixel[settings.method] * _pixels_that_count(settings.method, n, settings.size)
+    predicted = _gaussians_a_pixel[method] * _pixels_that_count(method, n, settings.size)
     fit, most = settings.refine, predicted
-    if settings.method == "tracks":
+    if method == "tracks":
         predicted = most = min(max(predicted, TRACKED[0]), TRACKED[1])
-    elif settings.method == "deform":
+    elif method == "deform":
         most = predicted
     else:
         if settings.budget != "ALL":
@@ -67,18 +66,18 @@ def estimate(settings, context) -> Estimate:
     kept = {"SHARE": predicted * settings.share / 100, "NUMBER": settings.number}.get(settings.budget, predicted)
     count = min(kept, most, predicted)
     if quality != "SECONDS":
-        fit = _fit_seconds(settings, n, count)
+        fit = _fit_seconds(settings, method, n, count)
     fits = 3 if settings.budget == "AUTO" else 1
     rendering = START_SECONDS + pixels * settings.samples * _learnt["seconds_a_sample"]
-    reconstructing = START_SECONDS + pixels * SECONDS_A_PIXEL[settings.method] + fit * fits
+    reconstructing = START_SECONDS + pixels * SECONDS_A_PIXEL[method] + fit * fits
     return Estimate(n, rendering, reconstructing * _learnt["pace"], round(count))
 
 
-def _fit_seconds(settings, pictures: int, gaussians: float) -> float:
+def _fit_seconds(settings, method: str, pictures: int, gaussians: float) -> float:
     """Of the steps of a quality with so many Gaussians."""
     size, steps, _ = QUALITIES[settings.quality]
     least, each = TRACK_STEPS
-    most = max(least, each * pictures) if settings.method == "tracks" else MOST_STEPS.get(settings.method, steps)
+    most = max(least, each * pictures) if method == "tracks" else MOST_STEPS.get(method, steps)
     size = settings.size / -(-settings.size // size)  # averaged down by a whole factor
     return min(steps, most) * (size**2 * STEP_A_PIXEL + gaussians * STEP_A_GAUSSIAN)
 

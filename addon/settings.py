@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
@@ -222,6 +224,14 @@ def part_is_selected(context) -> bool:
 def method(settings, objects: list) -> str:
     """The method that is used: Pictures Only in place of those that follow surfaces, where there hardly is one."""
     return "deform" if survey.mostly_without_surface(objects) else settings.method
+
+
+def expected_method(settings, context) -> str:
+    """As `method`, for what is drawn often: of large scenes nothing is looked at."""
+    if len(context.scene.objects) <= MANY:
+        with contextlib.suppress(InputError):
+            return method(settings, objects(settings, context))
+    return settings.method
 
 
 def cameras(context) -> tuple[list, str]:

@@ -43,3 +43,24 @@ tell(now=expected())
 part('addon').unregister()
 """
     assert blender(ESTIMATE + damaged)["now"] == first
+
+
+GLASS = """
+solid = expected()
+chosen.method = "deform"
+pictures = expected()
+chosen.method = "tracks"
+material = bpy.data.materials.new("glass")
+material.use_nodes = True
+material.node_tree.nodes["Principled BSDF"].inputs["Transmission Weight"].default_value = 1
+cube = bpy.data.objects["Cube"]
+cube.data.materials.clear()
+cube.data.materials.append(material)
+tell(solid=solid, pictures=pictures, glass=expected())
+part("addon").unregister()
+"""
+
+
+def test_it_is_of_the_method_that_is_used(blender):
+    told = blender(ESTIMATE + GLASS)
+    assert told["glass"] == told["pictures"] != told["solid"]
