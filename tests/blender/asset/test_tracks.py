@@ -31,7 +31,7 @@ def set_all(ob, values):
             sliders.set_input(sliders.asset_modifier(ob), name, value)
 def save(asset, name):
     with open(f"{sys.argv[1]}/{name}.pickle", "wb") as f:
-        pickle.dump(asset, f)
+        pickle.dump(asset, f, 4)  # numpy 1.26 cannot read what numpy 2 pickles by a later protocol
 def at(frame, ob, *names):
     scene.frame_set(int(frame // 1), subframe=frame % 1)
     return shown(ob, "position", "gs_alpha", *names)
