@@ -315,7 +315,7 @@ def test_the_buttons_below_a_result(window, installed, tmp_path):
         w.move(w.place[0], w.place[1] - 40)  # from the dialog's first field to its title
         time.sleep(0.7)
         w.key("Return")
-        w.wait_for("sum('timesplat' in o for o in bpy.data.objects) == 2")
+        w.wait_for("sum('timesplat_clip' in o for o in bpy.data.objects) == 2")
         assert w.ask(COUNT) <= left
         w.picture("baked")
 
@@ -401,4 +401,4 @@ def test_files_that_are_dropped_on_the_view(window, tmp_path):
         time.sleep(1)
         w.picture("refused")
         assert f"{tmp_path / 'letter.ply'}: it is not a .ply file" in w.ask("reports()")
-        assert w.ask("sum('timesplat' in o for o in bpy.data.objects)") == 3
+        assert w.ask("sum('timesplat_clip' in o for o in bpy.data.objects)") == 3
