@@ -20,14 +20,16 @@ import numpy as np
 from ...datagen import rigs
 from ...datagen.capture import Subject, capture
 from ...datagen.render_setup import CaptureSettings
-from ...datagen.scene.measure import normalisation, vertices_at
+from ...datagen.scene.measure import normalisation
 from ...datagen.scene.open import tool_versions
 from ...datagen.scene.simulate import simulate
-from ...datagen.scene.surfaces import MOST_FLOATS
+from ...datagen.scene.surfaces import MOST_FLOATS, follow_surfaces
 from ...datagen.sequence import InputError, Normalisation
 from ...datagen.tracks import MOST
 from ..asset.visibility import HIDDEN
 from . import background_blender, child_process
+
+LOOKS = 4  # frames by which it is judged whether all can be followed
 
 
 def start_capture(request: dict, folder: Path) -> child_process.Child:
@@ -35,16 +37,18 @@ def start_capture(request: dict, folder: Path) -> child_process.Child:
     return background_blender.start("addon.runtime.capture", request, folder)
 
 
-def clip_frames(request: dict, objects: list) -> list[int]:
+def clip_frames(request: dict, norm: Normalisation, objects: list) -> list[int]:
     """The scene frames of the clip: those of the pictures, and between them and up to the request's `last` as many,
-    just as evenly, as there is memory for to follow surfaces through: all of them, as a rule."""
+    just as evenly, as there is memory for to follow surfaces through: all of them, as a rule. None between where
+    something cannot be followed: motion vectors lead it from picture to picture."""
     taken, last = request["frames"], request.get("last")
-    if last is None or len(taken) < 2:
+    if last is None or len(taken) < 2 or (every := taken[1] - taken[0]) == 1:
         return taken
-    every = taken[1] - taken[0]
-    (shapes,) = vertices_at(taken[:1], objects)
-    followed = request["tracks"] or min(request["size"] ** 2, MOST)
-    most = MOST_FLOATS // max(3 * sum(len(points) for _, points in shapes), 7 * followed)
+    surfaces, untracked = follow_surfaces(taken[:: -(-len(taken) // LOOKS)], norm, objects)
+    if untracked:
+        return taken
+    points = request["tracks"] or min(request["size"] ** 2, MOST)
+    most = MOST_FLOATS // max(sum(s.vertices[0].size for s in surfaces), 7 * points)
     for step in range(1, every):
         if every % step == 0 and len(frames := range(taken[0], last + 1, step)) <= most:
             return list(frames)
@@ -92,8 +96,8 @@ def _capture(request: dict, progress) -> dict:
             ob.hide_render = False
     progress(0.02, "measuring the object")
     simulate(max(request["frames"][-1], request.get("last") or 0))
-    frames = clip_frames(request, objects)
-    norm, aabb = normalisation(request["frames"], objects, name=scene.name)  # what pictures show is within
+    norm, aabb = normalisation(request["frames"], objects, name=scene.name)
+    frames = clip_frames(request, norm, objects)
     taken, seed, rig = {frames.index(f): f for f in request["frames"]}, request.get("seed", 0), request.get("rig")
     if cameras and not rig:
         shots = camera_shots(scene, cameras, taken, norm, request["in_turn"])

@@ -16,10 +16,15 @@ def make(scene):
     return steps(1, 10, 4, method="tracks")
 case("swings", make)
 ob = bpy.data.objects["Box"]
-def chosen(points):
-    return capturing.clip_frames({"frames": [1, 5, 9], "last": 10, "tracks": points, "size": 24}, [ob])
+norm = capturing.Normalisation(3.0, (0.0, 0.0, 0.0))
+def chosen(points, objects=(ob,)):
+    asked = {"frames": [1, 5, 9], "last": 10, "tracks": points, "size": 24}
+    return capturing.clip_frames(asked, norm, list(objects))
 most = capturing.MOST_FLOATS // 7
 told["memory"] = [chosen(most // n) for n in (10, 9, 4)]
+blob = add("Blob", bpy.data.metaballs.new("Blob"))
+driver(blob.data.elements.new(), "radius", -1, "1 + frame / 9")
+told["blob"] = chosen(1, [ob, blob])
 tell(told=told)
 """
 
@@ -28,6 +33,7 @@ def test_surfaces_are_followed_between_pictures(tmp_path):
     told = Runner(tmp_path / "blender", CHECKOUT)(SETUP + SWINGS, tmp_path)["told"]
     assert told["swings"] == ""
     assert told["memory"] == [[*range(1, 11)], [1, 3, 5, 7, 9], [1, 5, 9]]
+    assert told["blob"] == [1, 5, 9], "whose topology changes"
     seq = read_sequence(tmp_path / "swings")
     assert (seq.frame_start, seq.frame_end, seq.fps) == (0, 9, 24)
     assert seq.provenance["scene_frames"] == [*range(1, 11)]
