@@ -62,7 +62,7 @@ def test_untrained_paper_head_starts_at_the_appendix_biases(views):
     torch.testing.assert_close(g.rgb, torch.full_like(g.rgb, 0.5))
     S = g.covariance4()
     equal = torch.exp(torch.tensor(-2.3)) ** 2 * torch.eye(4)  # equal scales: any rotation leaves a sphere …
-    equal[:3, :3] += (WIDER * views.pixel) ** 2 * torch.eye(3)  # … blurred as 3DGS's rasteriser does
+    equal[:3, :3] += (WIDER * views.pixel) ** 2 * torch.eye(3)  # … widened, for our rasteriser blurs less
     torch.testing.assert_close(S, equal.expand_as(S), atol=1e-6, rtol=1e-4)
     distance = (g.xyz - views.c2w[0, :3, 3])[: 32 * 32].norm(dim=-1)
     torch.testing.assert_close(distance, torch.full_like(distance, 2.3), atol=1e-5, rtol=0)

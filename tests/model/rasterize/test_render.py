@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from timesplat.model.rasterize import reference, render
-from timesplat.model.rasterize.constants import WIDER
+from timesplat.model.rasterize import render
 
 from .scenes import AXIS, FIELDS, cameras, cloud, gaussians, one_of, plane
 
@@ -141,12 +140,3 @@ def test_what_is_not_the_shape_is_not_looked_at():
     g, view = cloud(20), cameras()
     anything = replace(g, scale=torch.full((20, 3), math.nan), rotation=torch.zeros(20, 4))
     assert torch.equal(render(anything, *view)[0], render(g, *view)[0])
-
-
-def test_wider_is_as_3dgs_draws_it(monkeypatch):
-    """Before the middle of the camera, where a pixel has the size told."""
-    g, pixel = plane(20, 2.0, scale=(0.02, 0.1)), 2.0 / float(AXIS[1][0, 0])
-    g.xyz[:, :2] = 0
-    ours = render(g.widened(WIDER * pixel), *AXIS, backend="reference")[0]
-    monkeypatch.setattr(reference, "BLUR", 0.3)
-    torch.testing.assert_close(ours, render(g, *AXIS, backend="reference")[0], atol=1e-5, rtol=1e-4)
