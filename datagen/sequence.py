@@ -30,6 +30,7 @@ from .track_file import SurfaceTracks, read_tracks
 from .whole_folders import whole_folder
 
 FORMAT = "timesplat-sequence-1"
+FARTHEST = 3  # model time of a view: a clip's length before it, or after it
 HELD_OUT = {"val": "val", "test": "target"}  # splits whose views are no inputs, by the rig that says so
 
 
@@ -371,6 +372,9 @@ def check_sequence(seq: Sequence, path: Path) -> None:
             raise InputError(f"{path}: the camera of {name} is singular or not a rotation; correct it.")
         if not (v.fx > 0 and v.fy > 0 and np.isfinite([v.fx, v.fy, v.cx, v.cy]).all()):
             raise InputError(f"{path}: the focal length of {name} is not positive; correct it.")
+        if abs(seq.model_time(v.frame)) > FARTHEST:
+            clip = f"{seq.frame_start} to {seq.frame_end}"
+            raise InputError(f"{path}: {name} is of frame {v.frame}, far outside of the clip, {clip}; correct it.")
         # Of others' pictures, frames of videos among them, their reader has made sure.
         for rel in filter(None, (v.image, v.passes) if seq.picture is None else ()):
             _check_file(seq, path, folder, root, rel)

@@ -170,6 +170,7 @@ WRONG = {
     "frame NaN": (lambda d: d["frames"][1].update(frame=float("nan")), "the frame nan is not finite"),
     "no focal": (lambda d: [f.pop("fl_x") for f in d["frames"]] and None, "'camera_angle_x' is missing"),
     "focal 0": (lambda d: d["frames"][2].update(fl_x=0), "focal"),
+    "frame beyond": (lambda d: d["frames"][1].update(frame=2**63), "far outside of the clip"),
     "image outside": (lambda d: d["frames"][0].update(file_path="../../etc/passwd"), "outside"),
     "image missing": (lambda d: d["frames"][0].update(file_path="no.png"), "missing"),
     "passes missing": (lambda d: d["frames"][0].update(exr_path="no.exr"), "missing"),
