@@ -135,4 +135,5 @@ def test_the_same_gaussians_come_out(tmp_path, taken, first, way):
     assert decibels(mine, first[1].over()) > 14, "they are of the balls"
     assert decibels(mine, other) > WAYS[way]
     if WAYS[way] == ROUNDING:
-        assert 0.5 < len(fit[2]) / len(first[2]) < 2  # what joins late differs by rounding too
+        joined = way is large_and_far  # what joins late differs by rounding there
+        assert joined or len(fit[2]) == len(first[2])

@@ -60,10 +60,9 @@ def test_points_are_where_views_about_a_moment_agree_and_live_while_silhouettes_
     t = float(views.time[-1])
     xyz, rgb = missing_points(left, t, 6, generator)
     assert len(xyz) > 50 and ((xyz - PLACE).norm(dim=-1) < 0.4).all() and (rgb[:, 2] > rgb[:, 0]).all()
-    inner = xyz[(xyz - PLACE).norm(dim=-1) < 0.1]
+    inner = xyz[(xyz - PLACE).norm(dim=-1) < 0.07]
     life = lives(cloud, inner, views, t)
-    exact = torch.isclose(life, torch.tensor([(SINCE - 0.5) * STEP - 1, EVER])).all(1)
-    assert len(inner) > 20 and exact.float().mean() > 0.9
+    assert len(inner) and torch.allclose(life, torch.tensor([(SINCE - 0.5) * STEP - 1, EVER]).expand_as(life))
 
 
 def test_tracks_are_there_when_the_cloud_is():

@@ -59,8 +59,8 @@ def test_what_does_not_fit_is_refined(spheres, drawn, no_clock, method):
     assert len(drawn) == 29 and drawn[20:] == [48] * 9 and len(kept) > 150
 
 
-@pytest.mark.parametrize("method", ["tracks", "4dgs"])
-def test_what_small_pictures_fitted_is_as_wide_in_large_ones(drawn, method):
+@pytest.mark.parametrize(("method", "share"), [("tracks", 0.8), ("4dgs", 0.95)])
+def test_what_small_pictures_fitted_is_as_wide_in_large_ones(drawn, method, share):
     """Drawn in the pictures as they were given it is as good as in those that were fitted, but for what these lack."""
     views, others = scenes.views(), scenes.views(9, seed=5)
     QUALITIES["tiny"] = Quality(16, 200, 600)
@@ -70,7 +70,7 @@ def test_what_small_pictures_fitted_is_as_wide_in_large_ones(drawn, method):
     blur = 0.1 * 8 * views.pixel**2
     torch.testing.assert_close(wide.scale.square(), plain.scale.square() + blur)
     with torch.inference_mode():
-        assert squared_error(wide, others) < 0.95 * squared_error(plain, others)
+        assert squared_error(wide, others) < share * squared_error(plain, others)
         assert squared_error(plain, small) < squared_error(plain, others)
 
 
