@@ -45,8 +45,8 @@ class DeformFit:
     """How a cloud and its motion are fitted; rates of Adam at the start and at the end, those of places in pixels."""
 
     xyz: tuple[float, float] = (0.5, 0.02)
-    scale: tuple[float, float] = (3e-2, 4e-3)
-    rotation: tuple[float, float] = (1e-2, 1e-3)
+    scale: tuple[float, float] = (3e-2, 8e-3)
+    rotation: tuple[float, float] = (2e-2, 4e-3)
     rgb: tuple[float, float] = (2e-2, 2e-3)
     opacity: tuple[float, float] = (5e-2, 1e-2)
     motion: tuple[float, float] = (0.08, 0.0036)  # in steps of a frame in model time: the more frames, the slower
@@ -123,7 +123,7 @@ class _Fit:
         moves = float(views.time.max() - views.time.min()) > 0
         rates["motion"] = tuple(moves * views.frame_step * r for r in fit.motion)
         values = self._start(xyz, rgb, fit.start_opacity) | {"motion": self.table.zeros()}
-        self.parameters = Parameters(values, rates, common=["motion"])
+        self.parameters = Parameters(values, rates, common=["motion"], settling=["xyz", "motion"])
         self.densifier = self._densifier()
         self.half = self._half(0.0)  # how far from the middle the fit has come, and moments beyond it
         self.beyond = int((self.table.moments > self.half).sum()) + 1

@@ -4,8 +4,8 @@
 There are several levels of places, a single one, a dozen, …, some hundreds, whose motions add up: what moves together
 is found at once, and by all views, and what moves by itself is left to the fine ones. A table finds fast motion where
 a network over place and time (as of SC-GS) stays behind: of running animals 4 dB and more. Where each moment is seen by
-a view or two, there are fewer fine places, and the motion of a moment is added to one that takes several: what a view
-does not show is then as neighbouring times have it.
+a view or two, the motion of a moment is added to one that takes several: what a view does not show is then as
+neighbouring times have it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .posing import Pose
 
-LEVELS = (1, 12, 48, 192, 600)  # places of each; the last only where a time is seen by SEVERAL views
+LEVELS = (1, 12, 48, 192, 600)  # places of each
 MOMENTS = 40  # at the most
 NEAREST = 8  # places of a level that move a point
 BEYOND = 2  # moments before the clip, and after it
@@ -60,8 +60,7 @@ class MotionTable:
     def around(points: Tensor, frames: int, several: bool, generator: torch.Generator) -> MotionTable:
         """For an object of which points (N,3) are known, 1 or more, in a clip of so many frames. several: whether a
         time is seen by SEVERAL views."""
-        kept = LEVELS if several else LEVELS[:-1]
-        levels = [spread_points(points, n, generator) for n in kept if n <= len(points)]
+        levels = [spread_points(points, n, generator) for n in LEVELS if n <= len(points)]
         count = min(max(frames, 2), MOMENTS)
         last = 1 + BEYOND * 2 / (count - 1)
         moments = torch.linspace(-last, last, count + 2 * BEYOND)
@@ -105,7 +104,7 @@ class MotionTable:
     def among(self, values: Tensor, points: Tensor, generator: torch.Generator) -> tuple[MotionTable, Tensor]:
         """A table whose places are among points (N,3), 1 or more, and values with which all of these move about as
         they do with `values` (M+S,P,6): as the finest level has it, to which the others will add."""
-        levels = [spread_points(points, len(places), generator) for places in self.levels if len(places) <= len(points)]
+        levels = [spread_points(points, n, generator) for n in LEVELS if n <= len(points)]
         table = MotionTable(levels, _reach(levels), self.moments, self.slow, self.width)
         weights, moved = self.weights(levels[-1]), table.zeros()
         for m, t in enumerate(self.moments.tolist()):

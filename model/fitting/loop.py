@@ -203,7 +203,7 @@ def optimise(
         done += 1
         if after_backward:
             after_backward(done, fraction)
-        parameters.step(fraction)
+        parameters.step(fraction, plan.steps)
 
 
 def _measured(

@@ -16,6 +16,7 @@ from ..parallel import chunks, parallel_for
 
 BETAS, EPSILON = (0.9, 0.99), 1e-10  # Adam's; a shorter memory than usual, for hundreds of steps
 CHUNK = 1 << 16  # entries that a thread takes at once
+LONG = 1000  # steps, beyond which the last rates of what settles are the lower
 # Learning rates of Gaussians that are free to go anywhere, at the start and at the end of a fit.
 RATES = {
     "xyz": (4e-3, 4e-4),
@@ -40,10 +41,12 @@ class Parameters:
         values: dict[str, Tensor],
         rates: dict[str, tuple[float, float]],
         common: Collection[str] = (),
+        settling: Collection[str] = (),
     ):
         """values: name -> tensor of any shape; rates: name -> learning rate at the start and at the end of the
-        budget. common: names of what has no row for each Gaussian: `keep_rows` and `reset_moments` leave it alone."""
-        self.rates, self.common = rates, frozenset(common)
+        budget. common: names of what has no row for each Gaussian: `keep_rows` and `reset_moments` leave it alone.
+        settling: names of what comes to rest in a long fit: beyond LONG steps its last rate falls as one over them."""
+        self.rates, self.common, self.settling = rates, frozenset(common), frozenset(settling)
         self.values = {k: v.detach().clone().requires_grad_() for k, v in values.items()}
         self.moments = {k: (torch.zeros_like(v), torch.zeros_like(v)) for k, v in self.values.items()}
         self.steps = 0
@@ -52,13 +55,15 @@ class Parameters:
         return self.values[name]
 
     @torch.no_grad()
-    def step(self, fraction: float) -> None:
-        """One step of Adam (Kingma and Ba 2015) along the gradients, `fraction` 0..1 of the budget being spent.
-        Entries whose gradient is not finite count as 0."""
+    def step(self, fraction: float, steps: int = 0) -> None:
+        """One step of Adam (Kingma and Ba 2015) along the gradients, `fraction` 0..1 of the budget being spent, which
+        is so many `steps` in all, where that is known. Entries whose gradient is not finite count as 0."""
         self.steps += 1
         a, b = BETAS
         for k, v in self.values.items():
             first, last = self.rates[k]
+            if k in self.settling:
+                last *= LONG / max(steps, LONG)
             if v.grad is None or first == 0:
                 continue
             (m, s), rate = self.moments[k], first * (last / first) ** fraction / (1 - a**self.steps)

@@ -26,6 +26,14 @@ def test_adam_is_torchs_and_rates_decay():
     torch.testing.assert_close(p["fixed"].detach(), start, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("steps,last", [(0, 0.01), (1000, 0.01), (4000, 0.0025)])
+def test_in_a_long_fit_what_settles_does(steps, last):
+    p = Parameters({"a": torch.zeros(1), "b": torch.zeros(1)}, {"a": (0.1, 0.01), "b": (0.1, 0.01)}, settling=["a"])
+    (p["a"] + p["b"]).sum().backward()
+    p.step(1.0, steps)
+    assert p["a"].item() == pytest.approx(-last) and p["b"].item() == pytest.approx(-0.01)
+
+
 def test_rows_take_their_moments_along_and_nan_moves_nothing():
     p = Parameters({"a": torch.zeros(4), "b": torch.zeros(4, 2)}, {"a": (1.0, 1.0), "b": (1.0, 1.0)})
     (p["a"] * torch.arange(4.0)).sum().backward()
