@@ -35,7 +35,9 @@ from .thin import thinned
 
 LEAST = 8  # Gaussians that a fit begins with, whatever the budget
 TOLERANCE = 0.1  # of a pixel, within twice which tracks go as the cloud does
-PER_PIXEL = 2  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view
+PER_PIXEL = 2, 4  # Gaussians at the most, where no number is asked for, for each pixel that shows the object in a view,
+# and in a long fit to many views, of which there is one more for each …
+STEPS_MORE, VIEWS_MORE = 2000, 36  # … so many steps and so many views
 MAX_GAUSSIANS = 100_000
 SCENE_START = 10_000  # Gaussians at the start of a whole scene
 
@@ -87,10 +89,10 @@ class _Stage:
     pace: Pace  # by which there come to be so many
 
 
-def _stages(pyramid: Pyramid, views: Views, most: int) -> list[_Stage]:
+def _stages(pyramid: Pyramid, views: Views, most: int, steps: int) -> list[_Stage]:
     stages, since = [], 0.0
     for until, size in (*pyramid, (1.0, max(views.size))):
-        worthwhile = round(worth(views) / reduction(views, size) ** 2)
+        worthwhile = round(worth(views, steps) / reduction(views, size) ** 2)
         grow = Pace(25, since, (since + until) / 2, None) if stages else Pace(50, 0.1, 0.83 * until, None)
         stages.append(_Stage(until, max(min(worthwhile, most), LEAST), grow))
         since = until
@@ -100,14 +102,15 @@ def _stages(pyramid: Pyramid, views: Views, most: int) -> list[_Stage]:
 class _Fit:
     """The state of a fit, and what its steps ask for."""
 
-    def __init__(self, views: Views, max_gaussians: int, seed: int):
+    def __init__(self, views: Views, limit: int, seed: int, share: float = 1.0):
+        """limit: Gaussians that there may be at the most; share: of those that there would be."""
         self.several = len(views) >= SEVERAL * len(views.time.unique())
         fit = self.fit = FIT if self.several else ALONE
         self.views, self.pixel, self.seed = views, views.pixel, seed
         self.pyramid = pyramid_of(max(views.size))
         smaller = self.smaller = reduction(views, self.pyramid[0][1])
-        self.stages = _stages(self.pyramid, views, max_gaussians)
-        self.stage = self.stages[0]
+        self.limit, self.share = limit, share
+        self._expect(0)
         self.generator = torch.Generator().manual_seed(seed)
         order = views.time.abs().argsort(stable=True)
         at_once = int((views.time == views.time[order[0]]).sum())
@@ -228,6 +231,18 @@ class _Fit:
             self.parameters, self.generator, self.stage.gaussians, self.stage.pace, EDGE if self.whole else OUTSIDE
         )
 
+    def planned(self, steps: int) -> bool:
+        """Has there be as many Gaussians as so many steps are enough for; -> whether these are others than before."""
+        before = self.stages
+        self._expect(steps)
+        self.densifier = self._densifier()
+        return self.stages != before
+
+    def _expect(self, steps: int) -> None:
+        self.most = max(round(self.share * min(self.limit, worth(self.views, steps))), 1)
+        self.stages = _stages(self.pyramid, self.views, self.most, steps)
+        self.stage = self.stages[0]
+
     def cloud(self) -> DeformingCloud:
         return DeformingCloud(self.parameters.values, self.table, self.control, self.near, self.weight, self.whole)
 
@@ -278,9 +293,12 @@ class _Fit:
             self._bind()
 
 
-def worth(views: Views) -> int:
-    """How many Gaussians the pictures are worth, by the pixels that show the object in one of them; LEAST or more."""
-    return max(round(PER_PIXEL * float(views.alpha.sum((1, 2)).mean())), LEAST)
+def worth(views: Views, steps: int = 0) -> int:
+    """How many Gaussians the pictures are worth in so many steps, by the pixels that show the object in one of them;
+    LEAST or more."""
+    least, most = PER_PIXEL
+    per_pixel = min(max(min(steps / STEPS_MORE, len(views) / VIEWS_MORE), least), most)
+    return max(round(per_pixel * float(views.alpha.sum((1, 2)).mean())), LEAST)
 
 
 def reconstruct_deform(
@@ -300,15 +318,13 @@ def reconstruct_deform(
     `optimise`."""
     if quality:
         steps = quality.steps
-    most = min(quality.gaussians if quality else MAX_GAUSSIANS, worth(views))
     wanted = parse_budget(budget) if budget else None
     fewest = bool(budget) and wanted is None
-    if wanted is not None:
-        most = max(round(wanted * most), 1) if isinstance(wanted, float) else wanted
+    limit = wanted if isinstance(wanted, int) else quality.gaussians if quality else MAX_GAUSSIANS
     with gradients():
         views = detached(views)
         warm_up("cpu")
-        state = _Fit(views, most, seed)
+        state = _Fit(views, limit, seed, wanted if isinstance(wanted, float) else 1.0)
         schedule = Schedule(seconds=seconds, steps=steps, pyramid=state.pyramid, seed=seed)
         optimise(
             state.parameters,
@@ -318,6 +334,7 @@ def reconstruct_deform(
             schedule,
             choose=state.choose,
             grown=state.grown,
+            planned=state.planned,
             after_backward=state.after_backward,
             generator=state.generator,
             text="fitting motion and looks",
@@ -328,4 +345,4 @@ def reconstruct_deform(
         tracks = state.cloud().to_tracks(frames, TOLERANCE * state.pixel)
         if fewest:
             return thinned(tracks, views, max_loss, part(progress, 0.6, 1))
-        return tracks if len(tracks) <= most else tracks[tracks.opacity.topk(most).indices]
+        return tracks if len(tracks) <= state.most else tracks[tracks.opacity.topk(state.most).indices]

@@ -163,6 +163,7 @@ def optimise(
     extra_views: Views | None = None,
     choose: Choose | None = None,
     grown: Callable[[float], Gaussians4D | DynamicScene] | None = None,
+    planned: Callable[[int], bool] | None = None,
     after_backward: Callable[[int, float], object] | None = None,
     generator: torch.Generator | None = None,
     text: str = "optimising",
@@ -173,7 +174,9 @@ def optimise(
     A step draws `scene()` from a few of the views over a random colour, and descends on `loss(step)`. `extra_views`,
     where given, make up the rest of a step's share PHOTO_SHARE of `views`. `choose(fraction, count)` may say which of
     the views a step draws (indices), in place of all in turn in random order (None). `grown(fraction)` is the scene as
-    large as it will be, where it grows much: what steps cost is measured with it. `after_backward(number, fraction)`
+    large as it will be, where it grows much: what steps cost is measured with it. `planned(steps)` is told of how many
+    there will be; where it says that the scene grows otherwise for it, they are measured and planned anew.
+    `after_backward(number, fraction)`
     may change the parameters' rows after a step, while their gradients are still there. `generator` is what `scene` and
     `loss` take random numbers from, if they do: measuring the speed leaves it as it was. `progress(fraction, text)` is
     called about ten times a second, and with a line that has "planned" in it when steps are planned for seconds.
@@ -183,11 +186,17 @@ def optimise(
     if timed:
         warm_up(views.rgb.device.type)
     start, done, plan = work_clock(), 0, Plan(schedule.steps or 0)
+
+    def timed_plan() -> TimedPlan:
+        probing = PROBE_SHARE * schedule.seconds
+        costs = _measured(parameters, grown or (lambda _: scene()), loss, batches, probing, generator)
+        return TimedPlan(schedule.seconds, costs, work_clock() - start, schedule.max_steps)
+
     if timed:
-        costs = _measured(
-            parameters, grown or (lambda _: scene()), loss, batches, PROBE_SHARE * schedule.seconds, generator
-        )
-        plan = TimedPlan(schedule.seconds, costs, work_clock() - start, schedule.max_steps)
+        plan = timed_plan()
+    if planned and planned(plan.steps) and timed:
+        plan = timed_plan()
+    if timed:
         report.say(0.0, f"planned {plan.steps:,} steps of {schedule.batch} views in {schedule.seconds:.3g} s")
     while True:
         elapsed = work_clock() - start

@@ -2,6 +2,7 @@
 """The fit from pictures alone, of a small scene that moves: two blobs, of which one goes its way."""
 
 import numpy as np
+import pytest
 import torch
 
 from timesplat.datagen.rigs import spherical
@@ -62,13 +63,25 @@ def test_same_seed_same_tracks_and_a_quality_says_how_many():
 
 def test_there_are_few_while_pictures_are_small_and_as_many_as_they_are_worth_then():
     views = seen(0)
-    most = round(PER_PIXEL * float(views.alpha.sum((1, 2)).mean()))
+    most = round(PER_PIXEL[0] * float(views.alpha.sum((1, 2)).mean()))
     assert worth(views) == most and most > 50
     fit = _Fit(views, most, seed=0)
     few = round(most / 4)
     assert [stage.gaussians for stage in fit.stages] == [few, most] and len(fit.cloud()) <= few
     assert len(fit.grown(0.0)) == few and len(fit.grown(0.9)) == most
     assert len(reconstruct_deform(views, steps=400)) > few
+
+
+def test_a_long_fit_to_many_views_is_given_more():
+    views = seen(0)
+    many = views[torch.arange(108) % len(views)]
+    few, long, longer = (_Fit(many, 10_000, seed=0) for _ in range(3))
+    assert not few.planned(4000) and long.planned(6000) and longer.planned(60_000)
+    assert long.most == longer.most == worth(many, 6000) == pytest.approx(1.5 * few.most, rel=0.01)
+    assert long.stages[-1].gaussians == long.most and few.most == worth(many)
+    assert not _Fit(views, 10_000, seed=0).planned(60_000), "a few views are soon learnt by heart"
+    half = _Fit(many, 10_000, 0, 0.5)
+    assert half.planned(6000) and half.most == pytest.approx(long.most / 2, abs=1)
 
 
 def test_pictures_double_from_about_128_pixels_to_their_own_size():

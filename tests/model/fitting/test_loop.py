@@ -144,3 +144,23 @@ def test_a_plan_is_made_by_the_scene_as_large_as_it_will_be(spheres, clock):
     assert set(told) == {0.0, module.COARSE_UNTIL}
     steps = (100 - told.count(0.0) / 4 - told.count(module.COARSE_UNTIL)) / (0.6 * 0.25 + 0.4)
     assert said[0] == f"optimising: planned {min(round(steps), 150)} steps of 2 views in 100 s" and steps > 150
+
+
+def test_who_is_told_of_the_plan_may_make_the_scene_larger_and_is_planned_for_anew(spheres, clock):
+    with gradients():
+        views = detached(spheres([0, 12], size=100))
+        p, told, cost = Parameters({"rgb": torch.ones(1, 3)}, {"rgb": (0.1, 0.01)}), [], [1.0]
+
+        def loss(step):
+            clock[0] += cost[0]
+            return photometric_loss(step)
+
+        def planned(steps):
+            told.append(steps)
+            cost[0] = 2.0
+            return True
+
+        steps = optimise(p, lambda: blob(p), views, loss, Schedule(seconds=100), planned=planned)
+        assert told == [95] and 44 <= steps <= 46  # of 100 s, five of a second and two of two are measured first
+        optimise(p, lambda: blob(p), views, loss, Schedule(steps=3), planned=planned)
+    assert told == [95, 3]
