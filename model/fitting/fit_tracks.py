@@ -31,6 +31,7 @@ class TrackFit:
     opacity: tuple[float, float] = (1e-1, 1e-2)
     steps_a_view: int = 25  # beyond which views are learnt by heart …
     least_steps: int = 600  # … or so many
+    seldom: float = 1.0  # by which what is hidden from the views stays as it began, see `Parameters`
     faint: float = 0.02  # opacity below which a track leaves
 
 
@@ -75,7 +76,7 @@ def fit_tracks(
         views = detached(views)
         rates = {k: getattr(fit, k) for k in ("scale", "rotation", "rgb", "opacity")}
         rates["offset"] = tuple(pixel * r for r in fit.offset)
-        p = Parameters({k: x.clone() for k, x in raw_tracks(start).items()}, rates)
+        p = Parameters({k: x.clone() for k, x in raw_tracks(start).items()}, rates, seldom=fit.seldom)
         optimise(
             p,
             lambda: activate_tracks(p.values, start),

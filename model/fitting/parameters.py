@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import numba
@@ -42,11 +43,15 @@ class Parameters:
         rates: dict[str, tuple[float, float]],
         common: Collection[str] = (),
         settling: Collection[str] = (),
+        seldom: float = 0.0,
     ):
         """values: name -> tensor of any shape; rates: name -> learning rate at the start and at the end of the
         budget. common: names of what has no row for each Gaussian: `keep_rows` and `reset_moments` leave it alone.
-        settling: names of what comes to rest in a long fit: beyond LONG steps its last rate falls as one over them."""
+        settling: names of what comes to rest in a long fit: beyond LONG steps its last rate falls as one over them.
+        seldom: what is added to the divisor of Adam's steps, times a tensor's typical gradient (root mean square):
+        entries that views hardly speak of, such as those of what is hidden, then move little, not as fast as all."""
         self.rates, self.common, self.settling = rates, frozenset(common), frozenset(settling)
+        self.seldom = seldom
         self.values = {k: v.detach().clone().requires_grad_() for k, v in values.items()}
         self.moments = {k: (torch.zeros_like(v), torch.zeros_like(v)) for k, v in self.values.items()}
         self.steps = 0
@@ -69,13 +74,19 @@ class Parameters:
             (m, s), rate = self.moments[k], first * (last / first) ** fraction / (1 - a**self.steps)
             if v.device.type == "cpu" and v.dtype == torch.float32 and v.is_contiguous():
                 flat = [x.detach().reshape(-1).numpy() for x in (v, v.grad, m, s)]  # of a gradient it may be a copy
+                bias, least = 1 - b**self.steps, EPSILON
+                if self.seldom:
+                    now = np.square(np.nan_to_num(flat[1], nan=0, posinf=0, neginf=0)).mean()
+                    least += self.seldom * math.sqrt((b * flat[3].mean() + (1 - b) * now) / bias)
                 jobs = chunks(v.numel(), CHUNK)
-                parallel_for(jobs, lambda i, j, x=flat, r=rate: _adam(i, j, *x, r, 1 - b**self.steps))
+                parallel_for(jobs, lambda i, j, x=flat, r=rate, c=bias, e=least: _adam(i, j, *x, r, c, e))
             else:
                 g = v.grad.nan_to_num_(0, 0, 0)
                 m.lerp_(g, 1 - a)
                 s.mul_(b).addcmul_(g, g, value=1 - b)
-                v.addcdiv_(m, (s / (1 - b**self.steps)).sqrt_().add_(EPSILON), value=-rate)
+                root = (s / (1 - b**self.steps)).sqrt_()
+                least = EPSILON + self.seldom * root.square().mean().sqrt()
+                v.addcdiv_(m, root + least, value=-rate)
             v.grad = None
 
     @torch.no_grad()
@@ -112,10 +123,10 @@ class Parameters:
 
 
 @numba.njit(cache=True, nogil=True)
-def _adam(begin, end, value, gradient, mean, square, rate, bias):
+def _adam(begin, end, value, gradient, mean, square, rate, bias, least):
     """Adam's step of the entries begin..end of flat arrays, in one pass over them."""
     a, b = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
-    rate, bias, least = np.float32(rate), np.float32(1 / bias), np.float32(EPSILON)
+    rate, bias, least = np.float32(rate), np.float32(1 / bias), np.float32(least)
     for i in range(begin, end):
         g = gradient[i]
         g = g if np.isfinite(g) else np.float32(0)

@@ -34,6 +34,17 @@ def test_in_a_long_fit_what_settles_does(steps, last):
     assert p["a"].item() == pytest.approx(-last) and p["b"].item() == pytest.approx(-0.01)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_hardly_seen_moves_little(dtype):
+    """The compiled step in float32, torch's operations in float64; by hand: 0.1 g / (|g| + r), r the gradients' rms."""
+    p = Parameters({"a": torch.zeros(2, dtype=dtype)}, {"a": (0.1, 0.1)}, seldom=1.0)
+    g = torch.tensor([1.0, 1e-3], dtype=dtype)
+    (p["a"] * g).sum().backward()
+    p.step(0.0)
+    r = g.square().mean().sqrt()
+    torch.testing.assert_close(p["a"].detach(), -0.1 * g / (g + r), rtol=1e-4, atol=1e-9)
+
+
 def test_rows_take_their_moments_along_and_nan_moves_nothing():
     p = Parameters({"a": torch.zeros(4), "b": torch.zeros(4, 2)}, {"a": (1.0, 1.0), "b": (1.0, 1.0)})
     (p["a"] * torch.arange(4.0)).sum().backward()
