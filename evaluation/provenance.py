@@ -7,6 +7,7 @@ import hashlib
 import os
 import platform
 import subprocess
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -69,7 +70,8 @@ def revision(folder: Path) -> tuple[str | None, bool | None]:
 def file_hash(path: Path) -> str:
     """The first 12 hexadecimal digits of a file's SHA-256."""
     about = path.stat()
-    return _hash(path, about.st_mtime_ns, about.st_size)
+    fresh = time.time() - about.st_mtime < 2  # it may be written again at what a file system takes for the same time
+    return (_hash.__wrapped__ if fresh else _hash)(path, about.st_mtime_ns, about.st_size)
 
 
 @lru_cache(maxsize=256)
