@@ -89,12 +89,13 @@ class _Stage:
     pace: Pace  # by which there come to be so many
 
 
-def _stages(pyramid: Pyramid, views: Views, most: int, steps: int) -> list[_Stage]:
+def _stages(pyramid: Pyramid, views: Views, most: int, worthwhile: int) -> list[_Stage]:
+    """worthwhile: Gaussians that are worth having with whole pictures; with smaller ones there are fewer."""
     stages, since = [], 0.0
     for until, size in (*pyramid, (1.0, max(views.size))):
-        worthwhile = round(worth(views, steps) / reduction(views, size) ** 2)
+        here = round(worthwhile / reduction(views, size) ** 2)
         grow = Pace(25, since, (since + until) / 2, None) if stages else Pace(50, 0.1, 0.83 * until, None)
-        stages.append(_Stage(until, max(min(worthwhile, most), LEAST), grow))
+        stages.append(_Stage(until, max(min(here, most), LEAST), grow))
         since = until
     return stages
 
@@ -239,8 +240,9 @@ class _Fit:
         return self.stages != before
 
     def _expect(self, steps: int) -> None:
-        self.most = max(round(self.share * min(self.limit, worth(self.views, steps))), 1)
-        self.stages = _stages(self.pyramid, self.views, self.most, steps)
+        worthwhile = worth(self.views, steps)
+        self.most = max(round(self.share * min(self.limit, worthwhile)), 1)
+        self.stages = _stages(self.pyramid, self.views, self.most, worthwhile)
         self.stage = self.stages[0]
 
     def cloud(self) -> DeformingCloud:

@@ -84,9 +84,10 @@ class Parameters:
                 g = v.grad.nan_to_num_(0, 0, 0)
                 m.lerp_(g, 1 - a)
                 s.mul_(b).addcmul_(g, g, value=1 - b)
-                root = (s / (1 - b**self.steps)).sqrt_()
-                least = EPSILON + self.seldom * root.square().mean().sqrt()
-                v.addcdiv_(m, root + least, value=-rate)
+                root, least = (s / (1 - b**self.steps)).sqrt_(), EPSILON
+                if self.seldom:
+                    least += self.seldom * root.square().mean().sqrt()
+                v.addcdiv_(m, root.add_(least), value=-rate)
             v.grad = None
 
     @torch.no_grad()
