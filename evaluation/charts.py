@@ -27,8 +27,10 @@ from .labels import plain, settle
 from .metrics import METRICS
 
 BLUE, ORANGE, GREEN, PINK, YELLOW, SKY, BLACK, GREY = COLOURS
+PURPLE = "#7b3294"
 FAMILIES = {
     "tracks": BLACK,
+    "flow": PURPLE,
     "lift": GREY,
     "guided": BLUE,
     "rgb": ORANGE,

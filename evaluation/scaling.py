@@ -34,7 +34,7 @@ class Lines:
     size: tuple[int, ...] = (128, 256, 512)
     seconds: tuple[int, ...] = (3, 10, 30, 120)
     centre: tuple[int, int, int] = (96, 256, 30)
-    ways: tuple[str, ...] = ("tracks", "guided+refine", "deform", "4dgs")
+    ways: tuple[str, ...] = ("tracks", "flow", "deform", "4dgs")
 
     def points(self) -> list[tuple[int, int, int]]:
         """(views, size, seconds), the centre first and then by what they cost."""

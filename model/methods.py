@@ -7,7 +7,7 @@ The product's own are here. Those that it is compared with add themselves when `
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -110,6 +110,10 @@ def run_tracks(views: Views, options: ReconstructOptions, progress: Progress | N
     return reconstruct_tracks(views, seconds, steps=options.steps, quality=options.named_quality, **told)
 
 
+def run_flow(views: Views, options: ReconstructOptions, progress: Progress | None) -> ReconstructedScene:
+    return run_tracks(replace(views, surface=None, untracked=()), options, progress)
+
+
 def run_deform(views: Views, options: ReconstructOptions, progress: Progress | None) -> ReconstructedScene:
     from .deformation.fit import reconstruct_deform
 
@@ -140,6 +144,14 @@ register(
         "tracks",
         "ours: surface points followed through the clip, whose looks all views share, fitted",
         run_tracks,
+        has_depth=True,
+        fits=True,
+        budgets=True,
+    ),
+    Method(
+        "flow",
+        "ours: points that depth and motion vectors lead, whatever the renderer followed, likewise",
+        run_flow,
         has_depth=True,
         fits=True,
         budgets=True,

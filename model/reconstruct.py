@@ -18,22 +18,26 @@ from .tracks import Tracks4D
 from .views import Views, load_views, shrink
 
 DEFAULTS = ReconstructOptions()
+FOLLOWED = 4
 Scene = Gaussians4D | ReconstructedScene
 
 
 def default_method(sequence: Sequence, indices=None) -> str:
-    """What suits what was rendered: tracks where surfaces were followed, else guided where there is depth; of pictures
-    alone deform, which stays as small as the object whatever the number of views, where the network's Gaussians pile
-    up."""
+    """What suits what was rendered: tracks where surfaces were followed; else flow where there is depth, but where the
+    renderer found nothing that it could follow, as of a metaball whose surface comes and goes, only if FOLLOWED views
+    show a time: from fewer the network's Gaussians are the better ones; of pictures alone deform."""
     views = sequence.views if indices is None else [sequence.views[i] for i in indices]
     if not all(v.passes for v in views):
         return "deform"
-    return "tracks" if sequence.tracks else "guided"
+    if sequence.tracks:
+        return "tracks"
+    few = len(views) < FOLLOWED * len({v.frame for v in views})
+    return "guided" if sequence.untracked and few else "flow"
 
 
 def chosen_method(sequence: Sequence, asked: str | None, indices=None) -> str:
     """What was asked for, or `default_method`; this too in place of tracks where the renderer found nothing that it
-    could follow: of a metaball, whose surface comes and goes, motion vectors make worse tracks than the network."""
+    could follow."""
     nothing = asked == "tracks" and not sequence.tracks and bool(sequence.untracked)
     return default_method(sequence, indices) if nothing or not asked else asked
 

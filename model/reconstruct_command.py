@@ -27,15 +27,15 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("sequence", type=Path, help=f"folder that `timesplat render` wrote, or one of {LAYOUTS}")
     p.add_argument("--out", type=Path, required=True, help=".ply to write")
     add_reading(p)
-    p.add_argument("--method", help="tracks, lift, guided, deform, rgb, sweep, predicted, 4dgs (default: tracks "
-                   "where there are surface tracks, else guided where there is depth, else deform)")  # fmt: skip
+    p.add_argument("--method", help="tracks, flow, lift, guided, deform, rgb, sweep, predicted, 4dgs (default: "
+                   "tracks where there are surface tracks, else flow where there is depth, else deform)")  # fmt: skip
     p.add_argument("--quality", help="how much is fitted, and the same comes out however busy the machine is: the "
                    "longest side of the pictures, steps, most Gaussians. The pictures are averaged down by a whole "
                    "factor; a method that gains nothing from so many steps or Gaussians takes fewer; one that does not "
                    f"fit is refined. {meanings}. (default: for deform balanced, else none)")  # fmt: skip
     p.add_argument("--steps", type=int, help="exactly so many steps of the method's own fit, or of refinement where it "
                    "has none; in place of --quality")  # fmt: skip
-    p.add_argument("--seconds", type=float, help="for methods that fit the scene: tracks, deform, 4dgs; as many "
+    p.add_argument("--seconds", type=float, help="for methods that fit the scene: tracks, flow, deform, 4dgs; as many "
                    "steps are planned as fit (default: 10)")  # fmt: skip
     p.add_argument("--refine", type=float, default=0.0, help="seconds of fitting the result to the views (default: 0)")
     p.add_argument("--seed", type=int, default=0, help="of all that is random in fits (default: 0)")

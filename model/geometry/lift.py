@@ -9,7 +9,7 @@ footprint on the surface, its velocity from the motion vectors, its lifetime fro
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -24,6 +24,7 @@ from .scene_flow import SurfacePoints
 from .tracking import track_points
 
 MIN_ALPHA = 0.35  # pixels below it are background, or too mixed to have a depth
+AT_ONCE = 16  # views whose every pixel is looked at at a time, for memory's sake
 EMPTY_ALPHA = 0.02  # pixels below it show that there is nothing along their ray
 
 
@@ -99,6 +100,15 @@ class Seen(NamedTuple):
 
 def surface_seen(views: Views, settings: LiftSettings = BEFORE_NETWORK) -> Seen:
     """What views with depth and flow show. CPU tensors."""
+    found = [_seen_by(views[part], settings) for part in torch.arange(len(views)).split(AT_ONCE)]
+    valid = torch.cat([s.valid for s in found])
+    points = {f.name: torch.cat([getattr(s.points, f.name) for s in found]) for f in fields(SurfacePoints)}
+    points["view"] = valid.nonzero()[:, 0]
+    joined = (torch.cat([getattr(s, name) for s in found]) for name in ("ray", "scale", "axes", "observed"))
+    return Seen(valid, SurfacePoints(**points), *joined)
+
+
+def _seen_by(views: Views, settings: LiftSettings) -> Seen:
     depth = torch.where(torch.isfinite(views.depth), views.depth, 0.0)
     valid = (views.alpha > MIN_ALPHA) & (depth > 0)
     ray = camera_rays(views.intrinsics, *views.size)

@@ -9,6 +9,7 @@ it is there while that is little, and beyond only where no other point is known 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba
@@ -54,6 +55,7 @@ class MotionSettings(NamedTuple):
     sure: float = 0.7  # … as long as the sum is below this it is sure where the point is …
     lost: float = 6.0  # … up to where the sum is this, …
     gap: float = 2.0  # … and beyond where there is no other point so near
+    most_pixels: float = 4000.0  # that a view shows of the object; points are farther apart where pixels are finer
     prior: float = 0.03  # weight of the scene flow against what motion vectors say of a point's own step
     depth: float = 4.0  # weight of the depth of what is seen, as a multiple of that of its motion
     turn: float = 0.3  # share by which a normal that is seen turns the point's
@@ -78,7 +80,7 @@ def motion_tracks(views: Views, known: SurfaceTracks | None = None, settings: Mo
     but are not returned. CPU tensors."""
     frames = 1 if views.frame_step == 2 and not views.time.any() else round(2 / views.frame_step) + 1
     surface, field = surface_of(views)
-    rules = single(settings)
+    rules = single(_thinly(settings, views))
     there: list[_Points] = []
     if known is not None:
         window = np.stack([known.first, known.last], 1).astype(np.int64)
@@ -100,6 +102,13 @@ def motion_tracks(views: Views, known: SurfaceTracks | None = None, settings: Mo
         points.sure[:, 1].astype(np.int32),
         points.area,
     )
+
+
+def _thinly(settings: MotionSettings, views: Views) -> MotionSettings:
+    """Settings by which pictures of any size start about as many points as those of `most_pixels` do, enough for all
+    that a fit can use; each is followed by all pixels."""
+    farther = max(math.sqrt(float((views.alpha > 0.5).float().sum((1, 2)).mean()) / settings.most_pixels), 1.0)
+    return settings._replace(apart=farther * settings.apart, near=farther * settings.near)
 
 
 def _order(frames: int) -> list[int]:
@@ -138,12 +147,13 @@ def _sown(surface: Surface, f: int, frames: int, points: list[_Points], rules: M
 def _explain(places, j, surface, explained, near, deep):
     """Marks in explained (H,W) the pixels of view j that the places (n,3) explain."""
     height, width = explained.shape
+    around = max(int(near), 1)  # pixels, to each side
     for i in range(len(places)):
         u, v, depth = pixel_at(places[i], j, surface)
         if depth == 0:
             continue
-        for y in range(max(v - 1, 0), min(v + 2, height)):
-            for x in range(max(u - 1, 0), min(u + 2, width)):
+        for y in range(max(v - around, 0), min(v + around + 1, height)):
+            for x in range(max(u - around, 0), min(u + around + 1, width)):
                 r = surface.row[j, y, x]
                 if r >= 0 and not explained[y, x]:
                     across, along = off(places[i], r, surface)

@@ -34,11 +34,13 @@ def test_untrained_guided_network_is_the_lift(sphere_folder, checkpoint):
 
 def test_the_method_that_suits_what_was_rendered(sphere_folder, tmp_path):
     seq = read_sequence(sphere_folder)
-    assert chosen_method(seq, None) == "guided" and chosen_method(seq, "tracks") == "tracks"
+    assert chosen_method(seq, None) == "flow" and chosen_method(seq, "tracks") == "tracks"
     followed, nothing = replace(seq, tracks="tracks.npz"), replace(seq, untracked=["Smoke"])
     assert chosen_method(followed, None) == chosen_method(followed, "tracks") == "tracks"
     assert chosen_method(nothing, None) == chosen_method(nothing, "tracks") == "guided"
     assert chosen_method(followed, "lift") == chosen_method(nothing, "lift") == "lift"
+    several = replace(nothing, views=[replace(v, frame=v.frame // 4) for v in seq.views])
+    assert chosen_method(several, None) == chosen_method(several, "tracks") == "flow"
     bare = replace(seq, views=[replace(v, passes=None) for v in seq.views])
     assert chosen_method(bare, None) == "deform"
     assert untracked_note(seq) == "" and "Smoke, Fire: " in untracked_note(replace(seq, untracked=["Smoke", "Fire"]))

@@ -194,3 +194,12 @@ def test_a_lone_pixel_and_an_empty_view_are_finite(spheres):
     views.alpha = keep
     g = lift(views)
     assert len(g) >= 1 and all(torch.isfinite(getattr(g, k)).all() for k in ("xyz", "scale", "rotation", "sigma_t"))
+
+
+def test_views_are_looked_at_some_at_a_time_with_the_same_outcome(spheres, monkeypatch):
+    views = spheres(range(24))
+    whole = lift(views)
+    monkeypatch.setattr("timesplat.model.geometry.lift.AT_ONCE", 5)
+    parts = lift(views)
+    for a, b in zip(vars(whole).values(), vars(parts).values(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=0)

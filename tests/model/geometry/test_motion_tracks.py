@@ -10,7 +10,7 @@ import torch
 from timesplat.datagen.rigs import spherical
 from timesplat.datagen.sequence import opengl_to_opencv
 from timesplat.datagen.track_file import read_tracks, write_tracks
-from timesplat.model.geometry.motion_tracks import motion_tracks
+from timesplat.model.geometry.motion_tracks import MOTION, motion_tracks
 from timesplat.model.geometry.surface_tracks import surface_tracks
 from timesplat.model.rotations import rotation_matrix
 from timesplat.model.views import Views, rays
@@ -156,3 +156,13 @@ def test_a_moment_and_nothing_at_all(spheres):
     assert tracks.position.shape == (len(tracks), 1, 3) and 100 < len(tracks) <= int(still.alpha.sum())
     nothing = motion_tracks(replace(still, alpha=torch.zeros_like(still.alpha)))
     assert nothing.position.shape == (0, 1, 3) and nothing.rotation.shape == (0, 1, 4)
+
+
+def test_fine_pictures_start_no_more_points_than_a_fit_can_use():
+    views = turning_ball(96)
+    shown = float((views.alpha > 0.5).float().sum((1, 2)).mean())
+    every, some = (motion_tracks(views, settings=MOTION._replace(most_pixels=shown / n)) for n in (1, 4))
+    assert 0.15 < len(some) / len(every) < 0.4
+    assert some.area.sum() == pytest.approx(every.area.sum(), rel=0.3)
+    away = np.linalg.norm(some.position, axis=-1)[there(some)]
+    assert np.abs(away - RADIUS).max() < 2 * views.pixel
