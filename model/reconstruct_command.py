@@ -54,6 +54,7 @@ def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Progr
     anything is written."""
     from ..datagen.inspection import counts
     from .clip import clip_of
+    from .fitting.budget import parse_budget
     from .geometry.coverage import coverage
     from .io.ply import write_ply
     from .methods import ReconstructOptions, method_named
@@ -91,6 +92,9 @@ def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Progr
     write_ply(args.out, g.to_asset(clip_of(seq)))
     taken = time.perf_counter() - start
     print(f"{args.out}: {len(g)} Gaussians from {len(indices)} views in {taken:.1f} s ({method.name})")
+    wanted = parse_budget(args.budget) if args.budget else None
+    if isinstance(wanted, int) and len(g) < 0.9 * wanted:
+        print(f"{wanted:,} were asked for, which these pictures are not worth: give more or larger ones, or more steps")
     if method.has_depth and (note := untracked_note(seq)):
         print(note)
     if method.knows_surface and not (args.refine or args.budget or options.counted):

@@ -46,6 +46,13 @@ def test_road_from_sequence_to_usd(sphere_folder, tmp_path, capsys):
     assert "Gaussians" in said and "coverage" in said and usd.stat().st_size > 10_000
 
 
+def test_fewer_gaussians_than_were_asked_for_are_told(sphere_folder, tmp_path, capsys):
+    for method, number, told in (("flow", "500000", True), ("flow", "50", False), ("deform", "500000", True)):
+        command = ["reconstruct", str(sphere_folder), "--out", str(tmp_path / "a.ply"), "--method", method]
+        assert main([*command, "--budget", number, "--steps", "3"]) == 0
+        assert ("500,000 were asked for" in capsys.readouterr().out) == told
+
+
 @pytest.mark.parametrize("errors_too", [False, True])
 @pytest.mark.parametrize(
     ("words", "how"),
