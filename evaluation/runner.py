@@ -28,7 +28,7 @@ from .cache import Cache
 from .loading import collapsed, kept_inputs, kept_truth, thinned, without_depth
 from .method_spec import MethodSpec
 from .provenance import ROOT, file_hash, revision
-from .scoring import costs, draw, evaluate_views, reconstruct
+from .scoring import costs, draw, evaluate_views, psnr_of_finer, reconstruct
 
 WARM_UP_SECONDS = 0.1  # of a fit, before anything is timed
 
@@ -47,6 +47,7 @@ class Run:
     still: bool = False  # all times collapsed to 0
     step: int = 1  # the inputs are of every step-th frame, and make a clip of their own
     reading: ReadOptions = DEFAULTS  # what the user said of the folder
+    finer: int | None = None  # pixels at which PSNR is measured as well, to compare runs of several sizes
 
 
 def told_of(seq: Sequence, reading: ReadOptions) -> ReadOptions:
@@ -73,6 +74,7 @@ def key_of(run: Run, conditions: Conditions) -> str:
     how = (run.inputs, run.targets, run.size, run.still, run.step, conditions.left_out, conditions.device)
     parts = [_sequence_hash(run.folder), run.method.fingerprint, repr(how), str(conditions.costs)]
     parts += [repr(run.reading)] if run.reading != DEFAULTS else []  # rows of before know no such options
+    parts += [f"finer {run.finer}"] if run.finer else []
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:20]
 
 
@@ -163,6 +165,9 @@ def score_run(run: Run, conditions: Conditions, cache: Cache, key: str, load_dep
     if run.still:
         views, truth = collapsed(views), replace(truth, views=collapsed(truth.views))
     row, scene = evaluate_views(views, run.method, truth, conditions.device, conditions.left_out)
+    if run.finer:
+        finer = kept_truth(run.folder, run.targets, novel, run.finer, run.reading)
+        row["psnr_finer"] = psnr_of_finer(scene, views, finer)
     if conditions.costs:
         row |= costs(scene, views, truth, run.method, seq)
     if conditions.scenes:

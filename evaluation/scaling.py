@@ -4,7 +4,8 @@ one centre. A good method never falls along a line: whoever gives more must not 
 
 Views are those of the rig "mixed" (144 of 24 frames, all kinds of cameras), a part of them for fewer: evenly over the
 frames, and all that are in a smaller part are in a larger one. Scored are its held-out views, at the size of the
-inputs. Seconds are by the wall, on all cores.
+inputs, and along the line of sizes at the largest as well, so that its points can be compared. Seconds are by the wall,
+on all cores.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from .runner import Run
 
 OBJECTS = ("zoo:1000013", "zoo:1000101", "zoo:1000102", "zoo:1000104")  # no checkpoint was trained on them
 AXES = {"views": "input views", "size": "pixels a side", "seconds": "seconds"}
+KEYS = {"views": "psnr", "size": "finer", "seconds": "psnr"}  # what is compared along a line
 FALLS = 0.1  # dB by which a mean may fall along a line
-COLUMNS = ("object", "way", "views", "size", "seconds", "psnr", "worst", "ssim", "lpips", "gaussians", "taken")
+COLUMNS = ("object", "way", "views", "size", "seconds", "psnr", "finer", "worst", "ssim", "lpips", "gaussians", "taken")
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ def runs_of(sequences: dict[str, Sequence], lines: Lines) -> list[Run]:
     """Point by point, so that a run cut short has whole ones."""
     return [
         Run(name, seq.folder, parse_spec(f"{way}:{seconds}"), tuple(part_of(seq, views)),
-            tuple(protocol.held_out(seq)), size, {"way": way, "asked": seconds})
+            tuple(protocol.held_out(seq)), size, {"way": way, "asked": seconds},
+            finer=max(lines.size) if (views, seconds) == (lines.centre[0], lines.centre[2]) else None)
         for views, size, seconds in lines.points()
         for name, seq in sequences.items()
         for way in lines.ways
@@ -105,7 +108,12 @@ def measure_scaling(options, started: float) -> list[str]:
 
 def row_of(row: dict) -> dict:
     """COLUMNS of a row of the runner."""
-    told = {"seconds": row["asked"], "taken": row["seconds"], "gaussians": row["gaussians_kept"]}
+    told = {
+        "seconds": row["asked"],
+        "taken": row["seconds"],
+        "gaussians": row["gaussians_kept"],
+        "finer": row.get("psnr_finer"),
+    }
     told["worst"] = min(f for f in row["frames"]["psnr"] if f is not None)
     return {k: (row | told).get(k) for k in COLUMNS}
 
@@ -119,7 +127,7 @@ def means(rows: list[dict]) -> dict[tuple, dict[str, float]]:
     for r in rows:
         groups.setdefault((r["way"], r["views"], r["size"], r["seconds"]), []).append(r)
     most = max(map(len, groups.values()))
-    keys = ("psnr", "worst", "ssim", "lpips", "gaussians", "taken")
+    keys = ("psnr", "finer", "worst", "ssim", "lpips", "gaussians", "taken")
     return {
         k: {c: float(np.mean([r[c] for r in g])) for c in keys if all(r[c] is not None for r in g)}
         for k, g in groups.items()
@@ -128,15 +136,13 @@ def means(rows: list[dict]) -> dict[tuple, dict[str, float]]:
 
 
 def falls(found: dict[tuple, dict[str, float]], lines: Lines) -> list[str]:
-    """A sentence for each step along a line of views or seconds by which a mean falls by more than FALLS. Pixels are
-    scored at their own size, and so are not compared."""
+    """A sentence for each step along a line by which a mean falls by more than FALLS; along that of sizes, the mean at
+    the largest."""
     said = []
     for way in lines.ways:
         for i, (name, axis) in enumerate(AXES.items()):
-            if name == "size":
-                continue
             line = [(v, found.get((way, *lines.centre[:i], v, *lines.centre[i + 1 :]))) for v in getattr(lines, name)]
-            there = [(v, m["psnr"]) for v, m in line if m]
+            there = [(v, m[KEYS[name]]) for v, m in line if m and KEYS[name] in m]
             for (a, before), (b, after) in pairwise(there):
                 if after < before - FALLS:
                     said.append(f"{way} falls from {before:.2f} to {after:.2f} dB between {a} and {b} {axis}")
@@ -149,24 +155,38 @@ def write(out: Path, rows: list[dict], lines: Lines, made_by) -> str:
 
     found, (views, size, seconds) = means(rows), lines.centre
     draw(out / "scaling", found, lines, made_by.command)
-    head = ("way", "views", "pixels", "seconds", "PSNR", "worst view", "SSIM", "LPIPS", "Gaussians", "took, s")
+    head = (
+        "way",
+        "views",
+        "pixels",
+        "seconds",
+        "PSNR",
+        f"at {max(lines.size)}²",
+        "worst view",
+        "SSIM",
+        "LPIPS",
+        "Gaussians",
+        "took, s",
+    )
     cells = [
-        (*point, f"{m['psnr']:.2f}", f"{m['worst']:.2f}", f"{m['ssim']:.3f}",
+        (*point, f"{m['psnr']:.2f}", f"{m['finer']:.2f}" if "finer" in m else "", f"{m['worst']:.2f}",
+         f"{m['ssim']:.3f}",
          f"{m['lpips']:.3f}" if "lpips" in m else "", f"{m['gaussians']:.0f}", f"{m['taken']:.1f}")
         for point, m in sorted(found.items(), key=lambda x: (lines.ways.index(x[0][0]), x[0][1:]))
     ]  # fmt: skip
     objects = sorted({r["object"] for r in rows})
     notes = [
-        f"Means over {', '.join(objects)}; held-out views, at the inputs' size. Three lines through {views} views, "
+        f"Means over {', '.join(objects)}; held-out views, at the inputs' size (of other sizes, "
+        f"at {max(lines.size)}² too). Three lines through {views} views, "
         f"{size} pixels and {seconds} s.",
-        *(falls(found, lines) or [f"No mean falls by more than {FALLS} dB with more views or seconds."]),
+        *(falls(found, lines) or [f"No mean falls by more than {FALLS} dB with more views, pixels or seconds."]),
         "![PSNR along three lines](scaling.png)",
     ]
     return write_table(out / "scaling", "More views, pixels and seconds", head, cells, made_by, notes)
 
 
 def draw(stem: Path, found: dict[tuple, dict[str, float]], lines: Lines, command: str) -> None:
-    """A panel for each line, logarithmic, PSNR and the worst view (dotted) of every way."""
+    """A panel for each line, logarithmic, PSNR of every way; dotted the worst view, or at the largest size."""
     from .charts import FAMILIES
     from .figures import panels, save
 
@@ -176,13 +196,14 @@ def draw(stem: Path, found: dict[tuple, dict[str, float]], lines: Lines, command
             line = [(v, found.get((way, *lines.centre[:i], v, *lines.centre[i + 1 :]))) for v in getattr(lines, name)]
             there = [(v, m) for v, m in line if m]
             colour = FAMILIES[parse_spec(f"{way}:1").method]
-            for key, style in (("psnr", "o-"), ("worst", ":")):
-                ax.plot([v for v, _ in there], [m[key] for _, m in there], style, color=colour, ms=4,
+            for key, style in (("psnr", "o-"), ("finer" if name == "size" else "worst", ":")):
+                had = [(v, m[key]) for v, m in there if key in m]
+                ax.plot([v for v, _ in had], [y for _, y in had], style, color=colour, ms=4,
                         label=way if key == "psnr" and not i else None)  # fmt: skip
         ax.set_xscale("log")
         ax.set_xticks(getattr(lines, name), getattr(lines, name))
         ax.minorticks_off()
         ax.set_xlabel(axis)
-    axes[0].set_ylabel("PSNR in dB; dotted: of the worst view")
+    axes[0].set_ylabel(f"PSNR in dB; dotted: worst view, of sizes at {max(lines.size)}²")
     axes[0].legend(frameon=False)
     save(fig, stem, command)

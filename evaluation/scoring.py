@@ -19,11 +19,11 @@ from ..model.methods import METHODS, ReconstructOptions
 from ..model.parallel import work_clock
 from ..model.rasterize import render
 from ..model.rasterize.lifetime_index import QUICKER_FROM, LifetimeIndex
-from ..model.reconstruct import reconstruct_views
+from ..model.reconstruct import for_finer, reconstruct_views
 from ..model.views import BACKGROUND, Views
 from .loading import Truth
 from .method_spec import MethodSpec
-from .metrics import Pictures, measure, summarise
+from .metrics import METRICS, Pictures, measure, summarise
 
 
 def reconstruct(
@@ -82,6 +82,12 @@ def evaluate_views(
     each = (work_clock() - start - taken) / len(truth.picture)
     row = {"seconds": taken, "seconds_scoring": each, "gaussians": len(scene), "gaussians_kept": len(kept)}
     return summarise(frames) | row | {"frames": frames}, kept
+
+
+def psnr_of_finer(scene: Gaussians4D | ReconstructedScene, views: Views, truth: Truth) -> float:
+    """Mean PSNR over the pictures of truth, which may be finer than the views that the scene was fitted to."""
+    finer = for_finer(scene, max(truth.views.size) / max(views.size), views.pixel)
+    return summarise(score(finer, truth, tuple(k for k in METRICS if k != "psnr")))["psnr"]
 
 
 COSTS = ("ply_mb", "usd_mb", "render_ms", "coverage")

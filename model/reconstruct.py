@@ -88,12 +88,16 @@ def reconstruct_views(
 
 def _from_smaller(views: Views, by: int, run: Callable[[Views], Scene]) -> Scene:
     """What `run` makes of the views at 1/by of their size, to be drawn at their own."""
-    scene = run(shrink(views, by))
+    return for_finer(run(shrink(views, by)), by, by * views.pixel)
+
+
+def for_finer(scene: Scene, by: float, pixel: float) -> Scene:
+    """A scene that was fitted to pictures whose pixels have this size at the object, as it is to be drawn in pictures
+    `by` times as fine: there it would be less blurred by the rasteriser, a part of a pixel, than it was fitted."""
     if by > 1 and isinstance(scene, Gaussians4D | Tracks4D):
         from .rasterize.constants import BLUR
 
-        # They were fitted as they are drawn in the smaller pictures, blurred by some of the larger pixels.
-        return scene.widened(math.sqrt(BLUR * (by**2 - 1)) * views.pixel)
+        return scene.widened(math.sqrt(BLUR * (1 - by**-2)) * pixel)
     return scene
 
 

@@ -42,7 +42,8 @@ def test_the_lines_go_through_the_centre():
 
 def made_up(lines, psnr):
     return [
-        {"object": o, "way": w, "views": v, "size": p, "seconds": s, "psnr": psnr(v, p, s), "worst": 20.0, "ssim": 0.9,
+        {"object": o, "way": w, "views": v, "size": p, "seconds": s, "psnr": psnr(v, p, s), "worst": 20.0,
+         "finer": psnr(v, p, s) + 2 * p if (v, s) == (lines.centre[0], lines.centre[2]) else None, "ssim": 0.9,
          "lpips": None, "gaussians": 1000, "taken": s}
         for o in "ab" for w in lines.ways for v, p, s in lines.points()
     ]  # fmt: skip
@@ -57,6 +58,8 @@ def test_falling_lines_are_named_and_all_is_written(tmp_path):
     found = means(rows)
     assert len(found) == 2 * len(lines.points()) - 1
     assert falls(found, lines)[0] == "deform falls from 14.00 to 13.00 dB between 4 and 8 input views"
+    rows = made_up(lines, lambda v, p, s: 30 + v - 3 * p)
+    assert falls(means(rows), lines)[0] == "deform falls from 26.00 to 18.00 dB between 8 and 16 pixels a side"
     pytest.importorskip("matplotlib")
     text = write(tmp_path, rows, lines, Provenance.of("timesplat bench --scaling", []))
     assert "deform falls" in text and {"scaling.md", "scaling.csv", "scaling.png", "scaling.svg"} <= {

@@ -9,7 +9,8 @@ from timesplat.evaluation import protocol, scoring
 from timesplat.evaluation.image_quality import psnr
 from timesplat.evaluation.loading import load_truth
 from timesplat.evaluation.method_spec import parse_spec
-from timesplat.evaluation.scoring import COSTS, costs, draw, evaluate_views
+from timesplat.evaluation.scoring import COSTS, costs, draw, evaluate_views, psnr_of_finer
+from timesplat.model.rasterize.constants import BLUR
 from timesplat.model.views import load_views
 
 
@@ -101,3 +102,15 @@ def test_what_no_asset_can_hold_has_no_megabytes(seq, evaluated):
     _, scene = evaluated("lift")
     assert scoring.megabytes(Frozen(scene), seq) == (None, None)
     assert scoring.megabytes(scene, seq)[0] > 0.01
+
+
+def test_sizes_are_compared_in_the_finest_pictures(seq):
+    """In its own pictures a scene has its own PSNR; in finer ones, the blur that it was fitted with put back."""
+    targets = protocol.held_out(seq)
+    fine = load_truth(seq, targets, targets)
+    views = load_views(seq, range(24), True, fine.views.size[1] // 2)
+    row, scene = evaluate_views(views, parse_spec("lift"), own := load_truth(seq, targets, targets, views.size[1]))
+    assert psnr_of_finer(scene, views, own) == pytest.approx(row["psnr"], abs=1e-5)
+    put_back = scene.widened((BLUR * 3 / 4) ** 0.5 * views.pixel)
+    expected = psnr(draw(put_back, fine.views)[0], fine.picture).mean()
+    assert psnr_of_finer(scene, views, fine) == pytest.approx(float(expected), abs=1e-4)
