@@ -23,6 +23,10 @@ def notices(chosen, context, expected: Estimate) -> list[str]:
     end = survey.animation_end(scene.objects) if chosen.frame_range == "SCENE" else None
     if end is not None and frames.start < end < scene.frame_end:
         said.append(f"The animation ends at {end}: frames {frames.start} to {end} are captured.")
+    camera = scene.camera
+    if camera and not settings.cameras(context)[0] and survey.within(camera.matrix_world.translation, objects):
+        said.append(f"{camera.name} stands amid what is captured: of a room, select cameras that stand inside too, for "
+                    "the default ones stand outside.")  # fmt: skip
     if unseen := survey.without_surface(objects):
         kinds = " and ".join(sorted(set(unseen.values())))
         if chosen.method == "deform":

@@ -44,6 +44,13 @@ def surroundings(objects: list) -> list:
     return []
 
 
+def within(place, objects: list) -> bool:
+    """Whether a place lies in the box around the objects, of which there are not too many to look at."""
+    if len(objects) > MOST_SURVEYED or not len(points := np.concatenate([_corners(ob) for ob in objects] or [[]])):
+        return False
+    return bool((points.min(0) < np.array(place)).all() and (np.array(place) < points.max(0)).all())
+
+
 def _corners(ob) -> np.ndarray:
     """(N,3) corners of the box around an object, or of those around what it instances, in the world."""
     if ob.instance_type == "COLLECTION" and ob.instance_collection:

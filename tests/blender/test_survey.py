@@ -281,16 +281,21 @@ def refused():
         notices.refuse_views_from_outside(chosen, bpy.context)
     except InputError as e:
         return str(e)
+estimates = __import__("timesplat.addon.estimates", fromlist=["x"])
+def said():
+    return [x for x in notices.notices(chosen, bpy.context, estimates.estimate(chosen, bpy.context)) if "room" in x]
 eye.select_set(False)
-told = {"inside": refused()}
+told = {"inside": refused(), "inside_said": said()}
 eye.select_set(True)
 told["dark"] = refused()
 chosen.lighting = False
 told["chosen"] = refused()
+told["chosen_said"] = said()
 chosen.lighting = True
 eye.select_set(False)
 eye.location = (20, 0, 0)
 told["outside"] = refused()
+told["outside_said"] = said()
 tell(**told)
 """
 
@@ -298,5 +303,7 @@ tell(**told)
 def test_cameras_outside_of_a_room_are_refused(blender):
     told = blender(SCENE + ROOM)
     assert told["chosen"] is None and told["outside"] is None
+    assert told["chosen_said"] == told["outside_said"] == []
+    assert len(told["inside_said"]) == 1 and "Camera stands amid" in told["inside_said"][0]
     assert "Camera: they stand inside" in told["dark"] and "Studio Lighting" in told["dark"]
     assert "inside of what is captured" in told["inside"] and "stand inside too (Camera)" in told["inside"]
