@@ -35,7 +35,7 @@ class Axes:
     centre: tuple[str, ...] = (
         *("lift", "guided", "rgb", "predicted", "gs-lrm-all", "gs-lrm-frame", "hull"),
         *("guided+dense", "rgb+dense", "predicted+dense"),
-        *(f"{name}:{s}" for name in ("tracks", "deform", "4dgs", "som") for s in (1, 3, 10, 30)),
+        *(f"{name}:{s}" for name in ("tracks", "flow", "deform", "4dgs", "som") for s in (1, 3, 10, 30)),
         *(f"{name}+refine:{s}" for name in ("guided", "rgb") for s in (1, 3, 10, 30)),
         *(f"rgb+refine:{s}" for s in (0.1, 0.3, 0.6, 2)),
         *(f"guided+refine:{s}+budget:{n}" for s in (3, 10) for n in ("2.5%", "5%", "10%", "25%", "auto")),

@@ -5,7 +5,7 @@ one centre. A good method never falls along a line: whoever gives more must not 
 Views are those of the rig "mixed" (144 of 24 frames, all kinds of cameras), a part of them for fewer: evenly over the
 frames, and all that are in a smaller part are in a larger one. Scored are its held-out views, at the size of the
 inputs, and along the line of sizes at the largest as well, so that its points can be compared. Seconds are by the wall,
-on all cores.
+on all cores, or of several jobs on one each.
 """
 
 from __future__ import annotations
@@ -96,13 +96,13 @@ def measure_scaling(options, started: float) -> list[str]:
     if not sequences:
         raise InputError(f"{assets[0]}: nothing to measure; none of the assets could be rendered.")
     deadline = started + options.limit if options.limit is not None else float("inf")
-    how = Conditions(device=options.device, jobs=1, started=started, deadline=deadline)
+    how = Conditions(device=options.device, jobs=options.jobs, started=started, deadline=deadline)
     runs = runs_of(sequences, lines)
     rows = [row_of(r) for r in run_all(runs, cache, how, "measuring")]
     if not rows:
         raise InputError(f"{options.out}: nothing was measured in the time given; allow more.")
     made = Provenance.of(options.command, [r.method.weights for r in runs[: len(lines.ways)]])
-    print(write(options.out, rows, lines, made))
+    print(write(options.out, rows, lines, made, options.jobs))
     return failures
 
 
@@ -149,8 +149,9 @@ def falls(found: dict[tuple, dict[str, float]], lines: Lines) -> list[str]:
     return said
 
 
-def write(out: Path, rows: list[dict], lines: Lines, made_by) -> str:
-    """scaling.md and scaling.csv (means), scaling.png and .svg -> the page. made_by: a `Provenance`."""
+def write(out: Path, rows: list[dict], lines: Lines, made_by, jobs: int = 1) -> str:
+    """scaling.md and scaling.csv (means), scaling.png and .svg -> the page. made_by: a `Provenance`; jobs: how many
+    fits there were at a time."""
     from .figures import write_table
 
     found, (views, size, seconds) = means(rows), lines.centre
@@ -175,10 +176,12 @@ def write(out: Path, rows: list[dict], lines: Lines, made_by) -> str:
         for point, m in sorted(found.items(), key=lambda x: (lines.ways.index(x[0][0]), x[0][1:]))
     ]  # fmt: skip
     objects = sorted({r["object"] for r in rows})
+    cores = f"{jobs} at a time, one core each" if jobs > 1 else "on all cores"
     notes = [
         f"Means over {', '.join(objects)}; held-out views, at the inputs' size (of other sizes, "
         f"at {max(lines.size)}² too). Three lines through {views} views, "
-        f"{size} pixels and {seconds} s.",
+        f"{size} pixels and {seconds} s. Seconds by the wall, {cores}; took: with all "
+        "that comes before a fit.",
         *(falls(found, lines) or [f"No mean falls by more than {FALLS} dB with more views, pixels or seconds."]),
         "![PSNR along three lines](scaling.png)",
     ]

@@ -11,8 +11,8 @@ from pathlib import Path
 from ...datagen.sequence import InputError
 from .sweeps import SWEEPS
 
-METHODS = "tracks+steps:150,guided,deform+steps:300,4dgs+steps:300,rgb"
-QUICK_METHODS = "tracks+steps:60,guided,deform+steps:100,4dgs+steps:150,rgb"
+METHODS = "tracks+steps:150,flow+steps:150,guided,deform+steps:300,4dgs+steps:300,rgb"
+QUICK_METHODS = "tracks+steps:60,flow+steps:60,guided,deform+steps:100,4dgs+steps:150,rgb"
 ABOUT = (
     "Each sweep is one difficulty, from easy to hard. PSNR and FLIP over whole moments from a random pose at each and "
     "a camera that stands still, over white; a cross marks where 3 dB of the first level's are lost. ghost: alpha "
