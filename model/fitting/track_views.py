@@ -12,7 +12,7 @@ import numpy as np
 from ...datagen.sequence import InputError
 from ...datagen.track_file import SurfaceTracks
 from ..geometry.motion_tracks import motion_tracks
-from ..geometry.surface_tracks import needed_points, surface_tracks
+from ..geometry.surface_tracks import LED, SETTINGS, TrackSettings, needed_points, surface_tracks
 from ..tracks import Tracks4D
 from ..views import Views
 from .budget import FIRST_TRY, check_loss, parse_budget
@@ -54,7 +54,7 @@ def reconstruct_tracks(
     if quality:
         steps, limit = min(quality.steps, most), min(count or quality.gaussians, quality.gaussians)
         count = min(limit, needed_points(surface, views))
-    start = surface_tracks(surface, views, count)
+    start = surface_tracks(surface, views, count, _settings(views))
     if not (seconds or steps) or not len(start):
         return start
     schedule = Schedule(seconds=seconds, steps=steps, max_steps=most, pyramid=(), seed=seed)
@@ -80,6 +80,10 @@ def followed(views: Views) -> SurfaceTracks:
     return SurfaceTracks(**{k: a[order] for k, a in both.items()})
 
 
+def _settings(views: Views) -> TrackSettings:
+    return SETTINGS if views.surface is not None and len(views.surface) else LED
+
+
 def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None) -> int:
     """The fewest points with which a short fit comes within `max_loss` dB of one with twice as many, on views that
     neither was fitted to; as many as the pixels need, if fewer do not. Raises InputError for a loss not above 0."""
@@ -89,7 +93,7 @@ def fewest(surface: SurfaceTracks, views: Views, max_loss: float, progress=None)
     schedule = Schedule(steps=TRY_STEPS, pyramid=())
     while count < most:
         told = part(progress, 1 - 0.7 ** len(tried), 1 - 0.7 ** (len(tried) + 1))
-        start = surface_tracks(surface, fitted, count)
+        start = surface_tracks(surface, fitted, count, _settings(views))
         tried.append(psnr(fit_tracks(start, fitted, schedule, pixel=views.pixel, progress=told), unseen))
         if len(tried) > 1 and tried[-1] - tried[-2] <= max_loss:
             return count // 2

@@ -43,6 +43,7 @@ class TrackSettings:
 
 
 SETTINGS = TrackSettings()
+LED = TrackSettings(tolerance=0.3)  # of points that motion vectors lead, to not much better than that
 STEEPEST = 0.25  # cosine: what is seen under less is taken to be seen under this
 
 
