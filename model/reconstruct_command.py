@@ -85,6 +85,10 @@ def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Progr
         raise InputError(f"{args.sequence}: no rig {args.rig}; it has {', '.join(rigs)}.")
     indices = seq.select(rig=args.rig) if args.rig else seq.inputs()
     method = method_named(chosen_method(seq, args.method, indices))
+    if args.checkpoint and not method.checkpoint:
+        raise InputError(
+            f"{args.checkpoint}: {method.name} is no network and loads no weights; name one with --method."
+        )
     if args.seconds is None and not (args.refine or options.counted):
         options = replace(options, quality=method.quality)
     with bar() as progress:

@@ -130,9 +130,9 @@ def test_methods_and_checkpoints(sphere_folder, tmp_path, capsys):
     refused(capsys, "reconstruct", sphere_folder, "--out", out, "--method", "magic", says="no such method")
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes(b"\x10\0\0\0\0\0\0\0{")
-    refused(
-        capsys, "reconstruct", sphere_folder, "--out", out, "--checkpoint", bad, says="not a whole", names="bad.safe"
-    )
+    loaded = ("reconstruct", sphere_folder, "--out", out, "--checkpoint", bad)
+    refused(capsys, *loaded, "--method", "guided", says="not a whole", names="bad.safe")
+    refused(capsys, *loaded, says="flow is no network", names="bad.safe")
     refused(capsys, "reconstruct", sphere_folder, "--out", out, "--device", "abacus", says="cannot use this device")
     once = ("reconstruct", sphere_folder, "--out", out, "--quality", "draft")
     refused(capsys, *once, "--steps", "3", says="quality and steps: each says how long a fit goes on; give one of them")

@@ -17,10 +17,10 @@ def named(**wanted) -> set[str]:
 
 def test_what_methods_are():
     assert all(name == m.name and m.about for name, m in METHODS.items())
-    assert named(has_depth=True) == {"tracks", "lift", "guided"}
+    assert named(has_depth=True) == {"tracks", "flow", "lift", "guided"}
     assert named(knows_surface=True) == {"lift", "guided", "rgb", "sweep"}
-    assert named(fits=True) == {"tracks", "deform", "4dgs", "som"}
-    assert named(baseline=False) == {"lift", "guided", "rgb", "sweep", "deform", "tracks"}
+    assert named(fits=True) == {"tracks", "flow", "deform", "4dgs", "som"}
+    assert named(baseline=False) == {"lift", "guided", "rgb", "sweep", "deform", "tracks", "flow"}
     assert named(checkpoint="static") == {"gs-lrm-frame", "gs-lrm-all"}
     assert named(checkpoint="sweep") == {"rgb", "sweep"}
     assert all(m.about.startswith("ours") != m.baseline for m in METHODS.values())
@@ -30,7 +30,9 @@ def test_a_method_is_found_by_its_name(monkeypatch):
     monkeypatch.setattr("timesplat.model.methods.METHODS", dict(METHODS))
     register(Method("mine", "a test's", lambda views, options, progress: views))
     assert method_named("mine").run(3, None, None) == 3
-    with pytest.raises(InputError, match=r"^magic: no such method; choose one of tracks, lift, guided, .*mine\.$"):
+    with pytest.raises(
+        InputError, match=r"^magic: no such method; choose one of tracks, flow, lift, guided, .*mine\.$"
+    ):
         method_named("magic")
 
 
@@ -39,7 +41,7 @@ def test_without_baselines_there_are_the_products_methods():
     code = "import timesplat.model.reconstruct as r, sys; from timesplat.model.methods import METHODS; print(*METHODS)"
     code += "; print([m for m in sys.modules if 'baselines' in m])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.splitlines() == ["tracks lift guided rgb sweep deform predicted", "[]"]
+    assert out.splitlines() == ["tracks flow lift guided rgb sweep deform predicted", "[]"]
 
 
 @pytest.mark.parametrize(
