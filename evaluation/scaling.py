@@ -4,8 +4,8 @@ one centre. A good method never falls along a line: whoever gives more must not 
 
 Views are those of the rig "mixed" (144 of 24 frames, all kinds of cameras), a part of them for fewer: evenly over the
 frames, and all that are in a smaller part are in a larger one. Scored are its held-out views, at the size of the
-inputs, and along the line of sizes at the largest as well, so that its points can be compared. Seconds are by the wall,
-on all cores, or of several jobs on one each.
+inputs, and along the line of sizes at the largest as well, so that its points can be compared. Seconds are by the wall
+on all cores, or of several jobs the processor's, on one each.
 """
 
 from __future__ import annotations
@@ -176,11 +176,11 @@ def write(out: Path, rows: list[dict], lines: Lines, made_by, jobs: int = 1) -> 
         for point, m in sorted(found.items(), key=lambda x: (lines.ways.index(x[0][0]), x[0][1:]))
     ]  # fmt: skip
     objects = sorted({r["object"] for r in rows})
-    cores = f"{jobs} at a time, one core each" if jobs > 1 else "on all cores"
+    clock = f"of the processor, {jobs} fits at a time, one core each" if jobs > 1 else "by the wall, on all cores"
     notes = [
         f"Means over {', '.join(objects)}; held-out views, at the inputs' size (of other sizes, "
         f"at {max(lines.size)}² too). Three lines through {views} views, "
-        f"{size} pixels and {seconds} s. Seconds by the wall, {cores}; took: with all "
+        f"{size} pixels and {seconds} s. Seconds {clock}; took: with all "
         "that comes before a fit.",
         *(falls(found, lines) or [f"No mean falls by more than {FALLS} dB with more views, pixels or seconds."]),
         "![PSNR along three lines](scaling.png)",

@@ -111,7 +111,7 @@ def run_tracks(views: Views, options: ReconstructOptions, progress: Progress | N
 
 
 def run_flow(views: Views, options: ReconstructOptions, progress: Progress | None) -> ReconstructedScene:
-    return run_tracks(replace(views, surface=None, untracked=()), options, progress)
+    return run_tracks(replace(views, surface=None, untracked=False), options, progress)
 
 
 def run_deform(views: Views, options: ReconstructOptions, progress: Progress | None) -> ReconstructedScene:

@@ -11,14 +11,14 @@ import torch
 
 from ..datagen.sequence import InputError, Sequence
 from .checkpoints_io import CHECKPOINTS
-from .devices import check_device, fitting_device
+from .devices import fitting_device
 from .gaussians import Gaussians4D, ReconstructedScene
 from .methods import Method, Progress, ReconstructOptions, method_named
 from .tracks import Tracks4D
 from .views import Views, load_views, shrink
 
 DEFAULTS = ReconstructOptions()
-FOLLOWED = 4
+FOLLOWED = 4  # views of a time, see `default_method`
 Scene = Gaussians4D | ReconstructedScene
 
 
@@ -62,7 +62,6 @@ def reconstruct(
 
     Raises InputError for an unknown method, missing passes, a damaged image or checkpoint, a size that is no whole
     fraction, and a device that cannot be used."""
-    check_device(options.device)
     report = progress or (lambda fraction, text: None)
     method = chosen_method(sequence, method, indices)
     has_depth = method_named(method).has_depth

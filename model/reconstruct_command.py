@@ -54,6 +54,7 @@ def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Progr
     anything is written."""
     from ..datagen.inspection import counts
     from .clip import clip_of
+    from .devices import check_device
     from .fitting.budget import parse_budget
     from .geometry.coverage import coverage
     from .io.ply import write_ply
@@ -76,6 +77,7 @@ def run(args: argparse.Namespace, bar: Callable[[], AbstractContextManager[Progr
         budget=args.budget,
         max_loss=args.max_loss,
     )
+    check_device(args.device)
     seq = open_sequence(args.sequence, from_arguments(args))
     if "read" in seq.provenance:  # of others' data, in two lines; `inspect` says more
         print(counts(seq))
